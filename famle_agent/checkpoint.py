@@ -1,0 +1,195 @@
+"""Saving without pickle: JSON and safetensors in one zip, so that loading a file runs no code of it."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium import spaces
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor
+
+from famle_agent.online import OnlineState
+
+if TYPE_CHECKING:
+    from famle_agent.agent import ModelBasedAgent
+
+__all__ = ["File", "load_agent", "read_checkpoint", "save_agent", "write_checkpoint"]
+
+_FORMAT = "famle-agent"
+_VERSION = 1
+_META, _TENSORS = "agent.json", "tensors.safetensors"
+
+Agent = TypeVar("Agent", bound="ModelBasedAgent")
+File = str | os.PathLike[str] | BinaryIO
+
+
+def write_checkpoint(file: File, meta: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+    """Writes an agent; an older file at the same path stays whole until the new one is complete.
+
+    Args:
+        file: A path (``.zip`` is appended where it has no suffix; folders are made) or a binary file.
+        meta: What JSON can say.
+        tensors: What it cannot.
+    """
+    if not isinstance(file, (str, os.PathLike)):
+        file.write(_pack(meta, tensors))
+        return
+    path = _with_suffix(file)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_bytes(_pack(meta, tensors))
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read_checkpoint(file: File) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Reads what :func:`write_checkpoint` wrote.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is truncated, foreign, or of a newer version.
+    """
+    source: io.BytesIO | BinaryIO
+    if isinstance(file, (str, os.PathLike)):
+        path = Path(file) if Path(file).exists() else _with_suffix(file)
+        source = io.BytesIO(path.read_bytes())
+    else:
+        path, source = Path("the file"), file
+    try:
+        with zipfile.ZipFile(source) as archive:
+            meta = json.loads(archive.read(_META))
+            tensors = load_tensors(archive.read(_TENSORS))
+    except (zipfile.BadZipFile, KeyError, EOFError, UnicodeDecodeError, json.JSONDecodeError, SafetensorError) as error:
+        raise ValueError(
+            f"{path} is no FAMLE checkpoint, or it is damaged ({error}). "
+            "Give a file written by agent.save(); Stable-Baselines3's own zip files are another format."
+        ) from error
+    if not isinstance(meta, dict) or meta.get("format") != _FORMAT:
+        raise ValueError(f"{path} is no FAMLE checkpoint. Give a file written by agent.save().")
+    if meta.get("version") != _VERSION:
+        raise ValueError(
+            f"{path} has checkpoint version {meta.get('version')}, this package reads {_VERSION}; upgrade famle."
+        )
+    return meta, tensors
+
+
+def save_agent(agent: ModelBasedAgent, file: File) -> None:
+    """Writes all that an agent is: see :meth:`ModelBasedAgent.save`."""
+    live = agent._live
+    meta = {
+        "class": type(agent).__name__,
+        "mode": agent.mode,
+        "hyperparameters": agent.hyperparameters.to_dict(),
+        "observation_space": _box_to_json(agent.observation_space),
+        "action_space": _box_to_json(agent.action_space),
+        "angle_dims": list(agent._angle_dims),
+        "situations": list(agent.situations),
+        "env": agent._env_spec,
+        "needs_reward_fn": agent._reward_fn is not None,
+        "seed": agent.seed,
+        "live": None if live is None else {"steps": live.steps, "adaptations": live.belief.adaptations},
+    }
+    parts: dict[str, dict[str, Tensor]] = {
+        "dynamics": {} if agent.dynamics is None else agent.dynamics.state_dict(),
+        "reward": {} if agent._learned_reward is None else agent._learned_reward.state_dict(),
+        "live": {} if live is None else live.to_tensors(),
+        # The state of another device's generator means nothing elsewhere.
+        "generator": {"state": agent._generator.get_state()} if agent.device.type == "cpu" else {},
+    }
+    tensors = {f"{part}/{name}": value for part, values in parts.items() for name, value in values.items()}
+    write_checkpoint(file, meta, tensors)
+
+
+def load_agent(
+    cls: type[Agent], file: File, env: Any, *, reward_fn: Any, device: torch.device | str, **overrides: Any
+) -> Agent:
+    """Makes an agent from a file: see :meth:`ModelBasedAgent.load`."""
+    meta, tensors = read_checkpoint(file)
+    if meta["class"] != cls.__name__:
+        raise ValueError(f"The file holds an agent of class {meta['class']}; load it with {meta['class']}.load().")
+    if meta["needs_reward_fn"] and reward_fn is None:
+        raise ValueError("The agent was made with a reward_fn, which no file can hold: give load(..., reward_fn=...).")
+    if env is None and meta["env"] is not None and meta["env"]["id"] in gym.registry:
+        env = gym.make(meta["env"]["id"], **meta["env"]["kwargs"])
+    settings = {**meta["hyperparameters"], **overrides}
+    agent = cls(env, meta["mode"], reward_fn=reward_fn, angle_dims=meta["angle_dims"], device=device, **settings)
+    agent.situations, agent.seed = tuple(meta["situations"]), meta["seed"]
+    _restore_spaces(agent, _box_from_json(meta["observation_space"]), _box_from_json(meta["action_space"]))
+    _restore_tensors(agent, tensors, meta["live"])
+    return agent
+
+
+def _restore_spaces(agent: ModelBasedAgent, observation_space: spaces.Box, action_space: spaces.Box) -> None:
+    if agent.env is None:
+        agent.observation_space, agent.action_space, agent.n_envs = observation_space, action_space, 1
+    elif agent.observation_space != observation_space or agent.action_space != action_space:
+        raise ValueError(
+            f"The environment's spaces, {agent.observation_space} and {agent.action_space}, are not the agent's, "
+            f"{observation_space} and {action_space}."
+        )
+
+
+def _restore_tensors(agent: ModelBasedAgent, tensors: dict[str, Tensor], live: dict[str, int] | None) -> None:
+    def part(name: str) -> dict[str, Tensor]:
+        prefix = f"{name}/"
+        return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+
+    try:
+        if weights := part("dynamics"):
+            agent.dynamics = agent._new_dynamics(len(agent.situations))
+            agent.dynamics.load_state_dict(weights)
+        if weights := part("reward"):
+            agent._learned_reward = agent._new_reward()
+            agent._learned_reward.load_state_dict(weights)
+    except RuntimeError as error:
+        raise ValueError(
+            f"The file's weights do not fit its settings; it is damaged, or an override changed the network: {error}"
+        ) from error
+    if live is not None:
+        state = {name: value.to(agent.device) for name, value in part("live").items()}
+        agent._live = OnlineState.from_tensors(state, **live)
+    if agent.device.type == "cpu" and "generator/state" in tensors:
+        agent._generator.set_state(tensors["generator/state"])
+
+
+def _box_to_json(space: spaces.Box) -> dict[str, Any]:
+    """A Box space as JSON; infinite bounds are written as null."""
+
+    def bound(values: Any) -> list[float | None]:
+        return [float(value) if np.isfinite(value) else None for value in values.ravel()]
+
+    return {"low": bound(space.low), "high": bound(space.high), "shape": list(space.shape), "dtype": str(space.dtype)}
+
+
+def _box_from_json(values: dict[str, Any]) -> spaces.Box:
+    """The inverse of :func:`_box_to_json`."""
+    dtype, shape = np.dtype(values["dtype"]), tuple(values["shape"])
+    low = np.array([-np.inf if value is None else value for value in values["low"]], dtype=dtype).reshape(shape)
+    high = np.array([np.inf if value is None else value for value in values["high"]], dtype=dtype).reshape(shape)
+    return spaces.Box(low, high, dtype=dtype)
+
+
+def _pack(meta: dict[str, Any], tensors: dict[str, Tensor]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(_META, json.dumps({"format": _FORMAT, "version": _VERSION, **meta}, indent=1))
+        contiguous = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+        archive.writestr(_TENSORS, save_tensors(contiguous))
+    return buffer.getvalue()
+
+
+def _with_suffix(file: str | os.PathLike[str]) -> Path:
+    path = Path(file)
+    return path if path.suffix else path.with_name(path.name + ".zip")

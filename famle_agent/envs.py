@@ -1,0 +1,127 @@
+"""From whatever a user calls an environment to environments, one per situation."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
+
+from famle_agent.hyperparameters import known_robots
+from famle_envs.situation import Situation
+
+__all__ = ["EnvLike", "check_spaces", "env_attribute", "env_spec", "make_env", "situation_envs"]
+
+EnvLike = gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]] | Situation | Mapping[str, Any] | str
+"""An environment, a factory of one, or the situation of one."""
+
+
+def make_env(env: str | gym.Env[Any, Any] | VecEnv) -> gym.Env[Any, Any] | VecEnv:
+    """Makes an environment from a robot's short name or a Gymnasium id; passes anything else through.
+
+    Raises:
+        ValueError: The name is neither a known robot nor a registered id.
+    """
+    if not isinstance(env, str):
+        return env
+    robots = {name: robot.env_id for name, robot in known_robots().items() if robot.env_id}
+    try:
+        return gym.make(robots.get(env, env))
+    except gym.error.Error as error:
+        raise ValueError(
+            f"No environment is called {env!r}. Give a robot ({', '.join(robots)}), a registered Gymnasium id "
+            "or an environment."
+        ) from error
+
+
+def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+    """Refuses what a dynamics model cannot predict.
+
+    Raises:
+        ValueError: A space is no one-dimensional Box, or the actions are not bounded.
+    """
+    for name, space in (("observation", observation_space), ("action", action_space)):
+        if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+            raise ValueError(
+                f"The {name} space must be a one-dimensional Box, got {space}. For a dictionary or an image, use "
+                "gymnasium.wrappers.FlattenObservation; discrete actions are not supported."
+            )
+    if not action_space.is_bounded("both"):  # type: ignore[attr-defined]
+        raise ValueError(f"The action space must be bounded, got {action_space}; use gymnasium.wrappers.RescaleAction.")
+
+
+def env_spec(env: VecEnv) -> dict[str, Any] | None:
+    """The Gymnasium id and arguments of an environment as JSON types, if it is a registered one."""
+    spec = env.get_attr("spec")[0]
+    if spec is None:
+        return None
+    kwargs = {key: value.to_dict() if isinstance(value, Situation) else value for key, value in spec.kwargs.items()}
+    try:
+        json.dumps(kwargs)
+    except TypeError:  # an argument that no file can name
+        return None
+    return {"id": spec.id, "kwargs": kwargs}
+
+
+def situation_envs(
+    env: VecEnv, envs: Sequence[EnvLike] | None
+) -> tuple[list[gym.Env[Any, Any]], list[str], list[bool]]:
+    """One environment per training situation.
+
+    Args:
+        env: The agent's own environment; situations are put into new ones of its kind.
+        envs: What the user gave; None takes the training situations that the environment names.
+
+    Returns:
+        The environments, what their situations are called, and whether each was made here and is ours to close.
+
+    Raises:
+        ValueError: No situation is given or known, or the environment takes no ``situation``.
+    """
+    if envs is None:
+        envs = list(env_attribute(env, "training_situations", ()))
+        if not envs:
+            raise ValueError(
+                "This environment names no training situations. Call meta_learn(envs) with a list that holds one "
+                "environment, one factory or one Situation per situation."
+            )
+    if len(envs) == 0:
+        raise ValueError("meta_learn(envs) needs at least one environment, factory or Situation.")
+    made, labels, ours = [], [], []
+    for i, item in enumerate(envs):
+        is_env = isinstance(item, gym.Env)
+        made.append(_one_env(env, item))
+        situation = _get(made[-1], "situation", None)
+        label = situation.label if isinstance(situation, Situation) else f"situation {i}"
+        labels.append(label if label not in labels else f"{label} ({i})")
+        ours.append(not is_env)
+    return made, labels, ours
+
+
+def _one_env(env: VecEnv, item: EnvLike) -> gym.Env[Any, Any]:
+    if isinstance(item, gym.Env):
+        return item
+    if isinstance(item, (Situation, Mapping, str)):
+        spec = env.get_attr("spec")[0]
+        if spec is None:
+            raise ValueError("Situations need a registered environment; give environments or factories instead.")
+        try:
+            return gym.make(spec.id, **{**spec.kwargs, "render_mode": None, "situation": item})
+        except TypeError as error:
+            raise ValueError(f"{spec.id} takes no situation; give environments or factories instead.") from error
+    made = item()
+    if not isinstance(made, gym.Env):
+        raise ValueError(f"A factory must return a Gymnasium environment, got {type(made).__name__}.")
+    return made
+
+
+def _get(env: gym.Env[Any, Any], name: str, default: Any) -> Any:
+    return env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else default
+
+
+def env_attribute(env: VecEnv, name: str, default: Any) -> Any:
+    """An attribute of the first environment."""
+    return env.get_attr(name)[0] if env.has_attr(name) else default

@@ -1,0 +1,212 @@
+"""The settings of an agent, read from one YAML file a robot, and the parts they build."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Any, Literal
+
+import yaml
+
+from famle_agent.inner_loop import InnerLoop
+from famle_agent.meta_learning import Reptile
+from famle_agent.planning import ICEM, MPPI, Planner, RandomShooting
+
+__all__ = ["Hyperparameters", "Robot", "known_robots", "robot_of"]
+
+Mode = Literal["ours", "paper"]
+
+
+@dataclass(frozen=True)
+class Hyperparameters:
+    """Everything that can be tuned.
+
+    Attributes:
+        transitions_per_situation: n, random transitions simulated in each training situation.
+        action_hold: Steps that a random action is held while data are collected; the paper's is 1.
+        hidden: Width of each hidden layer of the dynamics model.
+        embedding_dim: Size of a situation embedding h.
+        gate_actions: Whether h scales the actions inside the model; the paper's network only concatenates it.
+        inner_optimizer: Optimiser of the inner loop, ``"sgd"`` (the paper's) or ``"adam"``.
+        inner_steps: k of meta-learning.
+        inner_lr: alpha, rate of theta in the inner loop.
+        embedding_lr: beta, rate of h in the inner loop.
+        batch_size: Transitions per inner step of meta-learning.
+        meta_iterations: Iterations of Algorithm 1.
+        meta_lr: alpha_meta.
+        embedding_meta_lr: beta_meta.
+        meta_batch_size: Situations per iteration of Algorithm 1; the paper's is 1.
+        adapt_every: K, robot steps between two adaptations; 0 never adapts.
+        memory_size: M, transitions that adaptation looks back on.
+        adapt_steps: k of online adaptation; None takes ``inner_steps``, 0 only selects an embedding.
+        adapt_lr: alpha of online adaptation; None takes ``inner_lr``.
+        adapt_embedding_lr: beta of online adaptation; None takes ``embedding_lr``.
+        forget_at_reset: Whether a new episode empties the memory; damage outlasts an episode, so not by default.
+        planner: ``"icem"``, ``"mppi"`` or ``"random_shooting"`` (the paper's).
+        horizon: H, steps that the planner looks ahead.
+        candidates: Sequences judged per iteration of the planner.
+        planner_iterations: Iterations of iCEM and MPPI.
+        elites: Sequences that iCEM refits its distribution to.
+        init_std: Deviation of the first candidates of iCEM and MPPI.
+        noise_beta: Exponent of the noise spectrum of iCEM and MPPI; 0 is white.
+        temperature: lambda of MPPI, in deviations of the candidates' returns.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    transitions_per_situation: int = 2000
+    action_hold: int = 1
+    hidden: tuple[int, ...] = (200, 200)
+    embedding_dim: int = 5
+    gate_actions: bool = True
+    inner_optimizer: Literal["sgd", "adam"] = "adam"
+    inner_steps: int = 20
+    inner_lr: float = 1e-3
+    embedding_lr: float = 1e-2
+    batch_size: int = 64
+    meta_iterations: int = 400
+    meta_lr: float = 1.0
+    embedding_meta_lr: float = 1.0
+    meta_batch_size: int = 20
+    adapt_every: int = 5
+    memory_size: int = 50
+    adapt_steps: int | None = None
+    adapt_lr: float | None = None
+    adapt_embedding_lr: float | None = None
+    forget_at_reset: bool = False
+    planner: Literal["icem", "mppi", "random_shooting"] = "icem"
+    horizon: int = 10
+    candidates: int = 100
+    planner_iterations: int = 3
+    elites: int = 10
+    init_std: float = 0.5
+    noise_beta: float = 2.0
+    temperature: float = 0.1
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hidden", tuple(int(width) for width in self.hidden))
+        for name, least in _LEAST.items():
+            value = getattr(self, name)
+            if value is not None and not value >= least:
+                raise ValueError(f"{name} must be at least {least}, got {value!r}.")
+        if not self.hidden or min(self.hidden) < 1:
+            raise ValueError(f"hidden must name the width of at least one layer, got {self.hidden}.")
+        for name, choices in _CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}.")
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Hyperparameters:
+        """Builds settings from a mapping.
+
+        Raises:
+            TypeError: A key is no setting, or a value is of the wrong type.
+        """
+        known = {field.name: field for field in dataclasses.fields(cls)}
+        for key, value in values.items():
+            if key not in known:
+                close = difflib.get_close_matches(key, known, n=1)
+                hint = f" Did you mean {close[0]!r}?" if close else ""
+                raise TypeError(f"There is no setting {key!r}.{hint} Settings: {', '.join(known)}.")
+            default = known[key].default
+            if isinstance(default, (int, float)) and (
+                isinstance(value, str) or isinstance(value, bool) != isinstance(default, bool)
+            ):
+                raise TypeError(f"{key} must be a {type(default).__name__}, got {value!r}.")
+        return cls(**values)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as JSON types."""
+        return dataclasses.asdict(self) | {"hidden": list(self.hidden)}
+
+    def inner_loop(self) -> InnerLoop:
+        """U^k of meta-learning."""
+        return InnerLoop(self.inner_steps, self.inner_lr, self.embedding_lr, self.inner_optimizer)
+
+    def adaptation(self) -> InnerLoop:
+        """U^k on the robot: the rule of meta-learning but where it was said otherwise."""
+
+        def own(value: Any, inherited: Any) -> Any:
+            return inherited if value is None else value
+
+        return InnerLoop(
+            own(self.adapt_steps, self.inner_steps),
+            own(self.adapt_lr, self.inner_lr),
+            own(self.adapt_embedding_lr, self.embedding_lr),
+            self.inner_optimizer,
+        )
+
+    def reptile(self) -> Reptile:
+        """Algorithm 1."""
+        return Reptile(
+            self.meta_iterations, self.meta_lr, self.embedding_meta_lr, self.meta_batch_size, self.batch_size
+        )
+
+    def make_planner(self) -> Planner:
+        """The model-predictive controller."""
+        if self.planner == "random_shooting":
+            return RandomShooting(self.horizon, self.candidates)
+        shared = {"iterations": self.planner_iterations, "init_std": self.init_std, "noise_beta": self.noise_beta}
+        if self.planner == "mppi":
+            return MPPI(self.horizon, self.candidates, temperature=self.temperature, **shared)  # type: ignore[arg-type]
+        return ICEM(self.horizon, self.candidates, elites=self.elites, **shared)  # type: ignore[arg-type]
+
+
+_LEAST = {
+    **dict.fromkeys(("transitions_per_situation", "action_hold", "embedding_dim", "inner_steps", "batch_size"), 1),
+    **dict.fromkeys(("meta_iterations", "meta_batch_size", "memory_size", "horizon", "candidates"), 1),
+    **dict.fromkeys(("planner_iterations", "elites"), 1),
+    **dict.fromkeys(("inner_lr", "embedding_lr", "meta_lr", "embedding_meta_lr", "adapt_every", "adapt_steps"), 0),
+    **dict.fromkeys(("adapt_lr", "adapt_embedding_lr", "init_std", "noise_beta", "temperature"), 0),
+}
+_CHOICES = {
+    "inner_optimizer": ("sgd", "adam"),
+    "planner": ("icem", "mppi", "random_shooting"),
+}
+
+
+@dataclass(frozen=True)
+class Robot:
+    """An entry of ``hyperparams/``: a robot, its environment and its settings in both modes.
+
+    Attributes:
+        env_id: The Gymnasium id; empty for the settings of an unknown environment.
+        modes: Settings by mode: ``paper`` is the paper's text, ``ours`` what we found to be best.
+    """
+
+    env_id: str
+    modes: dict[str, dict[str, Any]]
+
+    def hyperparameters(self, mode: str, **overrides: Any) -> Hyperparameters:
+        """The settings of a mode with some changed.
+
+        Raises:
+            TypeError: An override is no setting, or of the wrong type.
+            ValueError: The mode is unknown, or a value is out of range.
+        """
+        if mode not in self.modes:
+            raise ValueError(f"mode must be one of {', '.join(self.modes)}, got {mode!r}.")
+        return Hyperparameters.from_dict({**self.modes[mode], **overrides})
+
+
+@cache
+def known_robots() -> dict[str, Robot]:
+    """The robots that ``hyperparams/`` describes, by short name."""
+    robots = {}
+    for file in sorted(files("famle_agent").joinpath("hyperparams").iterdir(), key=lambda file: file.name):
+        if file.name.endswith(".yaml"):
+            entry = yaml.safe_load(file.read_text())
+            robots[file.name.removesuffix(".yaml")] = Robot(entry.pop("env_id"), entry)
+    return robots
+
+
+def robot_of(env_id: str | None) -> Robot:
+    """The entry of a Gymnasium id, or that of an unknown environment."""
+    for robot in known_robots().values():
+        if env_id is not None and robot.env_id == env_id:
+            return robot
+    return known_robots()["default"]

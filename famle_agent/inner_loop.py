@@ -1,0 +1,63 @@
+"""U^k(theta, h): k gradient steps on the network and the embedding together (the paper's eq. 8 and 12).
+
+Meta-learning and online adaptation share this rule, since the one learns the starting point of the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from famle_agent.dynamics import Batch, Dynamics, Theta
+
+__all__ = ["InnerLoop"]
+
+
+@dataclass(frozen=True)
+class InnerLoop:
+    """The update rule U^k.
+
+    Attributes:
+        steps: k, the number of gradient steps.
+        lr: alpha, the rate of theta.
+        embedding_lr: beta, the rate of h.
+        optimizer: ``"sgd"`` (the paper's) or ``"adam"``.
+    """
+
+    steps: int
+    lr: float
+    embedding_lr: float
+    optimizer: Literal["sgd", "adam"] = "sgd"
+
+    def __call__(
+        self, model: Dynamics, theta: Theta, h: Tensor, sample: Callable[[], Batch]
+    ) -> tuple[Theta, Tensor, Tensor]:
+        """Takes k steps for B situations at once; they do not influence each other.
+
+        Args:
+            model: The model whose loss is descended.
+            theta: Stacked parameters to start from; not changed.
+            h: Embeddings to start from, (B, embedding_dim); not changed.
+            sample: Gives the data of each step.
+
+        Returns:
+            theta~, h~ and the loss before each step, (k, B).
+        """
+        theta = {name: value.detach().clone().requires_grad_() for name, value in theta.items()}
+        h = h.detach().clone().requires_grad_()
+        groups = [{"params": list(theta.values()), "lr": self.lr}, {"params": [h], "lr": self.embedding_lr}]
+        optimizer = {"sgd": torch.optim.SGD, "adam": torch.optim.Adam}[self.optimizer](groups, foreach=True)
+        losses = []
+        with torch.enable_grad():
+            for _ in range(self.steps):
+                loss = model.loss(theta, h, sample())
+                optimizer.zero_grad()
+                loss.sum().backward()  # type: ignore[no-untyped-call]
+                optimizer.step()
+                losses.append(loss.detach())
+        history = torch.stack(losses) if losses else torch.empty(0, len(h))
+        return {name: value.detach() for name, value in theta.items()}, h.detach(), history

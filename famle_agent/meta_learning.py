@@ -1,0 +1,93 @@
+"""Algorithm 1 of the paper: Reptile on the network and the situation embeddings together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from famle_agent.dynamics import Batch, Dynamics, expand
+from famle_agent.inner_loop import InnerLoop
+
+__all__ = ["MetaStep", "Reptile"]
+
+
+@dataclass(frozen=True)
+class MetaStep:
+    """What one iteration did.
+
+    Attributes:
+        iteration: Number of iterations done.
+        situations: Indices of the situations of this iteration, (B,).
+        loss_before: Mean loss before the first inner step.
+        loss_after: Mean loss before the last inner step.
+    """
+
+    iteration: int
+    situations: Tensor
+    loss_before: float
+    loss_after: float
+
+
+@dataclass(frozen=True)
+class Reptile:
+    """Meta-learns theta and H from the data of N situations.
+
+    Attributes:
+        iterations: Number of meta-iterations.
+        meta_lr: alpha_meta, the step from theta towards theta~; decays linearly to 0.
+        embedding_meta_lr: beta_meta, the step from h towards h~; decays with it.
+        meta_batch_size: Situations per iteration; 1 is the paper's.
+        batch_size: Transitions per inner step.
+    """
+
+    iterations: int
+    meta_lr: float
+    embedding_meta_lr: float
+    meta_batch_size: int
+    batch_size: int
+
+    @torch.no_grad()
+    def __call__(
+        self,
+        model: Dynamics,
+        data: Batch,
+        inner_loop: InnerLoop,
+        generator: torch.Generator,
+        callback: Callable[[MetaStep], bool] = lambda _: True,
+    ) -> None:
+        """Runs Algorithm 1 on ``model`` in place.
+
+        Args:
+            model: Randomly initialised model; its theta and embeddings become the meta-trained ones.
+            data: Encoded transitions of the N situations.
+            inner_loop: U^k.
+            generator: Source of all the chance.
+            callback: Called after each iteration; returning False ends meta-learning.
+        """
+        n_situations = model.n_situations
+        meta_batch_size = min(self.meta_batch_size, n_situations)
+        for iteration in range(self.iterations):
+            c = torch.randperm(n_situations, generator=generator)[:meta_batch_size].to(data.x.device)
+            theta, h = model.parameters_by_name(), model.embeddings[c]
+
+            sample = partial(self._sample, data, c, generator)
+            theta_tilde, h_tilde, losses = inner_loop(model, expand(theta, meta_batch_size), h, sample)
+
+            decay = 1.0 - iteration / self.iterations
+            for name, value in model.theta.items():
+                value.lerp_(theta_tilde[name].mean(dim=0), decay * self.meta_lr)
+            model.embeddings[c] = h.lerp(h_tilde, decay * self.embedding_meta_lr)
+
+            step = MetaStep(iteration + 1, c, losses[0].mean().item(), losses[-1].mean().item())
+            if not callback(step):
+                return
+
+    def _sample(self, data: Batch, c: Tensor, generator: torch.Generator) -> Batch:
+        """A minibatch of each situation in ``c``."""
+        shape = (len(c), self.batch_size)
+        i = torch.randint(data.x.shape[1], shape, generator=generator).to(data.x.device)
+        return Batch(data.x[c[:, None], i], data.y[c[:, None], i], data.weight[c[:, None], i])

@@ -1,0 +1,122 @@
+"""The loop of Algorithm 2 on B robots in step with each other: remember, adapt every K steps, plan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from famle_agent.adaptation import Belief, Memory
+from famle_agent.planning import Model, Planner, RewardFn, imagine, shift
+
+__all__ = ["OnlineLoop", "OnlineState"]
+
+
+@dataclass(frozen=True)
+class OnlineState:
+    """What B robots carry from one step to the next, as a recurrent policy carries its hidden state. Immutable.
+
+    Attributes:
+        memory: The last M transitions.
+        belief: The adapted model.
+        plan: Where the next search for actions begins, (B, H, action_dim).
+        last: The observation and the action of the last step, (B, obs_dim) and (B, action_dim); None where
+            somebody else reports the transitions.
+        steps: Steps on which at least one robot had a transition.
+    """
+
+    memory: Memory
+    belief: Belief
+    plan: Tensor
+    last: tuple[Tensor, Tensor] | None = None
+    steps: int = 0
+
+    @property
+    def robots(self) -> int:
+        """B."""
+        return len(self.plan)
+
+    def to_tensors(self) -> dict[str, Tensor]:
+        """All but :attr:`last` and the counts, for a checkpoint."""
+        tensors = {f"theta.{name}": value for name, value in self.belief.theta.items()}
+        tensors |= {f"memory.{name}": value for name, value in vars(self.memory).items()}
+        return tensors | {"h": self.belief.h, "log_likelihood": self.belief.log_likelihood, "plan": self.plan}
+
+    @classmethod
+    def from_tensors(cls, tensors: dict[str, Tensor], steps: int, adaptations: int) -> OnlineState:
+        """The inverse of :meth:`to_tensors`."""
+
+        def part(prefix: str) -> dict[str, Tensor]:
+            return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+
+        belief = Belief(part("theta."), tensors["h"], tensors["log_likelihood"], adaptations)
+        return cls(Memory(**part("memory.")), belief, tensors["plan"], steps=steps)
+
+
+@dataclass(frozen=True)
+class OnlineLoop:
+    """One step of Algorithm 2.
+
+    Attributes:
+        prior: What B robots believe before they have seen anything.
+        adapt: The belief after the transitions in the memory (lines 6 and 7).
+        simulator: The model that a belief stands for.
+        reward_fn: r(s, a, s') with actions in [-1, 1].
+        planner: MPC (line 8).
+        adapt_every: K; 0 never adapts.
+        forget_at_reset: Whether a new episode empties a robot's memory.
+    """
+
+    prior: Callable[[int], Belief]
+    adapt: Callable[[Memory, Belief], Belief]
+    simulator: Callable[[Belief], Model]
+    reward_fn: RewardFn
+    planner: Planner
+    adapt_every: int
+    forget_at_reset: bool
+
+    def begin(self, memory: Memory) -> OnlineState:
+        """The state of B robots with an empty memory."""
+        robots, _, action_dim = memory.action.shape
+        plan = torch.zeros(robots, self.planner.horizon, action_dim, device=memory.action.device)
+        return OnlineState(memory, self.prior(robots), plan)
+
+    def remember(self, state: OnlineState, obs: Tensor, starts: Tensor) -> OnlineState:
+        """Inserts the transition that ends here (lines 9 and 10), and adapts every K.
+
+        Args:
+            state: The state after the last action.
+            obs: Where the robots are now, (B, obs_dim).
+            starts: Which robots were just reset, (B,): what led here is no transition of theirs.
+        """
+        if state.last is None:
+            return state
+        memory = state.memory.add(*state.last, obs, valid=~starts)
+        if starts.all():
+            return replace(state, last=None)
+        state = replace(state, memory=memory, last=None, steps=state.steps + 1)
+        if self.adapt_every and state.steps % self.adapt_every == 0:
+            state = replace(state, belief=self.adapt(state.memory, state.belief))
+        return state
+
+    @torch.no_grad()
+    def act(
+        self, state: OnlineState, obs: Tensor, starts: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, OnlineState]:
+        """Plans an action in [-1, 1], (B, action_dim), with the adapted model (line 8)."""
+        state = self.reset(state, starts)
+        simulator = self.simulator(state.belief)
+        action, plan = self.planner.plan(
+            lambda tau: imagine(simulator, self.reward_fn, obs, tau), state.plan, generator
+        )
+        return action, replace(state, plan=shift(plan), last=(obs, action))
+
+    def reset(self, state: OnlineState, starts: Tensor) -> OnlineState:
+        """Voids the plans of the robots in ``starts`` (B,), and their memories where it was asked for."""
+        kept = ~starts
+        if self.forget_at_reset:
+            memory = replace(state.memory, weight=state.memory.weight * kept[:, None])
+            state = replace(state, memory=memory, belief=state.belief.where(kept, self.prior(state.robots)))
+        return replace(state, plan=state.plan * kept[:, None, None])

@@ -1,0 +1,70 @@
+"""Between the units of an environment and those of the model, with the checks that belong there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from torch import Tensor
+
+__all__ = ["ActionScale", "check_action", "check_observation"]
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True)
+class ActionScale:
+    """Actions of a Box space as [-1, 1] and back.
+
+    Attributes:
+        low: Lower bounds, (action_dim,).
+        high: Upper bounds, (action_dim,).
+    """
+
+    low: Tensor
+    high: Tensor
+
+    def to_unit(self, action: Tensor) -> Tensor:
+        """From the action space to [-1, 1], (..., action_dim)."""
+        return 2.0 * (action - self.low) / (self.high - self.low) - 1.0
+
+    def from_unit(self, action: Tensor) -> Tensor:
+        """From [-1, 1] to the action space, (..., action_dim)."""
+        return self.low + 0.5 * (action + 1.0) * (self.high - self.low)
+
+
+def check_observation(observation: Any, space: spaces.Box) -> Array:
+    """An observation (obs_dim,) or (B, obs_dim) as an array.
+
+    Raises:
+        ValueError: It has another shape, is not finite, or is the pair that Gymnasium's ``reset`` returns.
+    """
+    if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
+        raise ValueError("Got (obs, info), as Gymnasium's reset() returns it; give obs alone.")
+    return _check("observation", observation, space)
+
+
+def check_action(action: Any, space: spaces.Box) -> Array:
+    """An action (action_dim,) or (B, action_dim) as an array.
+
+    Raises:
+        ValueError: It has another shape or is not finite.
+    """
+    return _check("action", action, space)
+
+
+def _check(name: str, values: Any, space: spaces.Box) -> Array:
+    try:
+        array = np.asarray(values, dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"The {name} must be an array of numbers, got {type(values).__name__}.") from error
+    if array.ndim not in (1, 2) or array.shape[-1:] != space.shape:
+        raise ValueError(
+            f"The {name} must have shape {space.shape}, or (B, {space.shape[0]}) for B robots, got {array.shape}."
+        )
+    if not np.isfinite(array).all():
+        raise ValueError(f"The {name} holds NaN or infinite values: {array}. Check the robot's sensors and commands.")
+    return array

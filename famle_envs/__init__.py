@@ -1,0 +1,17 @@
+"""Simulated robots that can break: Gymnasium environments with a ``situation``.
+
+Importing the package registers ``FamleReacher-v0``.
+"""
+
+import gymnasium as gym
+
+from famle_envs.situation import Situation
+
+__all__ = ["Situation"]
+
+gym.register(
+    id="FamleReacher-v0",
+    entry_point="famle_envs.reacher:ReacherEnv",
+    max_episode_steps=50,
+    reward_threshold=30.0,
+)

@@ -1,0 +1,232 @@
+"""A robot in one PyBullet world: loading, resetting, stepping, rendering, and where a situation is applied."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from importlib.resources import as_file, files
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+import pybullet
+from gymnasium import spaces
+
+from famle_envs.situation import Situation, resolve_situation
+
+__all__ = ["Array", "BulletEnv"]
+
+Array = npt.NDArray[np.floating[Any]]
+
+_HOLDING_FORCE = 1e4  # of a locked joint, far above what any motor here can exert (N m)
+_FAULTY_COLOUR = (0.85, 0.25, 0.2, 1.0)
+
+
+class BulletEnv(gym.Env[Array, Array]):
+    """Base of the robots: one robot, one private physics world, one situation at a time.
+
+    A situation acts on the physics and on the sensors, never on the task. It stays until it is changed,
+    over any number of resets. The same seed, situation and actions give the same bits.
+
+    Args:
+        situation: What is wrong with the robot: a :class:`Situation`, a mapping of its fields, a
+            preset's name or a description such as ``"joint 3 dead"``. None is the intact robot.
+        render_mode: None or ``"rgb_array"``.
+
+    Raises:
+        TypeError: The situation is of no such type.
+        ValueError: The situation is unknown or this robot cannot have it, or the render mode is unknown.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (Gymnasium's own type)
+
+    asset: ClassVar[str]
+    """File of the robot's description in ``famle_envs/assets``."""
+    joints: ClassVar[tuple[int, ...]]
+    """PyBullet's indices of the motorised joints; a :class:`Situation` counts joints in this order."""
+    supported_faults: ClassVar[frozenset[str]]
+    """The fields of a :class:`Situation` that this robot can have."""
+    time_step: ClassVar[float]
+    """Duration of one physics step, in s."""
+    physics_steps: ClassVar[int]
+    """Physics steps per control step."""
+    angle_dims: ClassVar[tuple[int, ...]] = ()
+    """Observation dimensions that are angles in [-pi, pi], where pi and -pi are the same place."""
+    training_situations: ClassVar[tuple[Situation, ...]]
+    """The situations of the paper's meta-training."""
+    presets: ClassVar[Mapping[str, Situation]]
+    """Situations by name."""
+
+    action_space: spaces.Box  # type: ignore[assignment]
+    observation_space: spaces.Box  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        *,
+        situation: Situation | Mapping[str, Any] | str | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(
+                f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}. "
+                "For a window, wrap an 'rgb_array' environment in gymnasium.wrappers.HumanRendering."
+            )
+        self.render_mode = render_mode
+        self._situation = self._resolve(situation)
+        self._client: int | None = None
+        self._locked_at: dict[int, float] = {}
+        self._load()
+
+    @property
+    def situation(self) -> Situation:
+        """What is wrong with the robot now."""
+        return self._situation
+
+    def set_situation(self, situation: Situation | Mapping[str, Any] | str | None) -> None:
+        """Breaks or repairs the robot, from this moment on and in the middle of an episode too.
+
+        Raises:
+            TypeError: The situation is of no such type.
+            ValueError: The situation is unknown, or this robot cannot have it.
+        """
+        self._situation = self._resolve(situation)
+        self._apply_situation()
+
+    @classmethod
+    def _resolve(cls, situation: Situation | Mapping[str, Any] | str | None) -> Situation:
+        resolved = resolve_situation(situation, cls.presets)
+        return resolved.for_robot(cls.__name__, len(cls.joints), cls.supported_faults)
+
+    @abstractmethod
+    def _actuate(self, action: Array) -> None:
+        """Sets the motors for one control step. ``action`` has shape (n_joints,) and lies in the action space."""
+
+    @abstractmethod
+    def _observe(self) -> Array:
+        """The observation as the sensors give it, faults included, as float32."""
+
+    @staticmethod
+    @abstractmethod
+    def _camera() -> dict[str, Any]:
+        """Arguments of PyBullet's ``computeViewMatrixFromYawPitchRoll`` but for the up axis."""
+
+    @abstractmethod
+    def reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
+        """The reward of a batch of transitions; see the robot."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        """Puts the robot at its start.
+
+        Args:
+            seed: Seed of the environment's generator.
+            options: ``{"situation": ...}`` changes the situation from now on.
+
+        Raises:
+            TypeError: The situation is of no known type.
+            ValueError: An option is unknown, or the robot cannot have the situation.
+        """
+        super().reset(seed=seed)
+        options = options or {}
+        for key in options:
+            if key != "situation":
+                raise ValueError(f"reset knows no option {key!r}; the only one is 'situation'.")
+        if "situation" in options:
+            self._situation = self._resolve(options["situation"])
+        pybullet.restoreState(self._start, physicsClientId=self._world)
+        self._apply_situation()
+        self._obs = self._observe()
+        return self._obs.copy(), self._info()
+
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Applies an action for one control period.
+
+        Raises:
+            ValueError: The action has the wrong shape or is not finite. It is clipped to the action space.
+        """
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != self.action_space.shape or not np.isfinite(action).all():
+            raise ValueError(f"The action must be {self.action_space.shape} finite numbers, got {action}.")
+        self._actuate(np.clip(action, self.action_space.low, self.action_space.high))
+        self._hold_locked_joints()
+        for _ in range(self.physics_steps):
+            pybullet.stepSimulation(physicsClientId=self._client)
+        previous, self._obs = self._obs, self._observe()
+        reward = float(self.reward_fn(previous, action, self._obs))
+        return self._obs.copy(), reward, False, False, self._info()
+
+    def render(self) -> npt.NDArray[np.uint8] | None:
+        """A picture of the robot, (480, 480, 3); None without a render mode."""
+        if self.render_mode is None:
+            gym.logger.warn("render() needs gym.make(..., render_mode='rgb_array').")
+            return None
+        view = pybullet.computeViewMatrixFromYawPitchRoll(upAxisIndex=2, **self._camera())
+        projection = pybullet.computeProjectionMatrixFOV(fov=60, aspect=1.0, nearVal=0.1, farVal=100.0)
+        _, _, pixels, _, _ = pybullet.getCameraImage(
+            480,
+            480,
+            view,
+            projection,
+            renderer=pybullet.ER_TINY_RENDERER,
+            physicsClientId=self._world,
+        )
+        return np.asarray(pixels, dtype=np.uint8).reshape(480, 480, 4)[:, :, :3].copy()
+
+    def close(self) -> None:
+        """Ends the physics world; a second call does nothing."""
+        if self._client is not None:
+            pybullet.disconnect(physicsClientId=self._client)
+            self._client = None
+
+    @property
+    def _world(self) -> int:
+        if self._client is None:
+            raise RuntimeError("The environment is closed; make a new one.")
+        return self._client
+
+    def _load(self) -> None:
+        self._client = pybullet.connect(pybullet.DIRECT)
+        client = self._client
+        # Sleeping and unordered contact pairs would make a run depend on the runs before it.
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=self.time_step, deterministicOverlappingPairs=1, physicsClientId=client
+        )
+        pybullet.setGravity(0.0, 0.0, -9.81, physicsClientId=client)
+        with as_file(files("famle_envs") / "assets" / self.asset) as path:
+            self._robot = self._load_robot(str(path), client)
+        self._colours = {
+            shape[1]: shape[7] for shape in pybullet.getVisualShapeData(self._robot, physicsClientId=client)
+        }
+        self._start = pybullet.saveState(physicsClientId=client)
+
+    @abstractmethod
+    def _load_robot(self, path: str, client: int) -> int:
+        """Loads the robot and all that stands around it, in the start pose; returns the robot's body."""
+
+    def _apply_situation(self) -> None:
+        states = pybullet.getJointStates(self._robot, self.joints, physicsClientId=self._world)
+        self._locked_at = {self.joints[joint]: states[joint][0] for joint in self._situation.locked_joints}
+        if self.render_mode is not None:
+            self._colour_faulty_joints()
+
+    def _hold_locked_joints(self) -> None:
+        if self._locked_at:
+            pybullet.setJointMotorControlArray(
+                self._robot,
+                list(self._locked_at),
+                pybullet.POSITION_CONTROL,
+                targetPositions=list(self._locked_at.values()),
+                forces=[_HOLDING_FORCE] * len(self._locked_at),
+                physicsClientId=self._world,
+            )
+
+    def _colour_faulty_joints(self) -> None:
+        faulty = {self.joints[joint] for joint, gain in enumerate(self._situation.motor_gain) if gain != 1.0}
+        faulty |= set(self._locked_at)
+        for link, colour in self._colours.items():
+            rgba = _FAULTY_COLOUR if link in faulty else colour
+            pybullet.changeVisualShape(self._robot, link, rgbaColor=rgba, physicsClientId=self._world)
+
+    def _info(self) -> dict[str, Any]:
+        # A string: Gymnasium wants nothing in `info` to be shared between two steps.
+        return {"situation": self._situation.label}
