@@ -177,7 +177,7 @@ class Dynamics(nn.Module):
     def forward(network: Network, x: Tensor) -> Tensor:
         """Mean of the normalised targets, (B, n, obs_dim), for normalised inputs (B, n, inputs)."""
         for weight, bias in network[:-1]:
-            x = F.silu(torch.baddbmm(bias, x, weight))
+            x = F.silu(torch.baddbmm(bias, x, weight), inplace=not torch.is_grad_enabled())
         weight, bias = network[-1]
         return torch.baddbmm(bias, x, weight)
 

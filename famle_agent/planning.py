@@ -15,6 +15,8 @@ from torch import Tensor
 
 __all__ = ["ICEM", "MPPI", "Judge", "Model", "Planner", "RandomShooting", "RewardFn", "imagine", "shift"]
 
+_CANDIDATES_AT_ONCE = 2500
+
 Judge = Callable[[Tensor], Tensor]
 """Candidate actions (B, N, H, action_dim) -> the return of each, (B, N)."""
 
@@ -38,13 +40,19 @@ def imagine(model: Model, reward_fn: RewardFn, obs: Tensor, actions: Tensor) -> 
     Returns:
         The return of each candidate, (B, N); -inf where the model left the finite numbers.
     """
+    # A few thousand candidates at a time stay in the processor's cache over the whole horizon.
+    returns = [_imagine(model, reward_fn, obs, part) for part in actions.split(_CANDIDATES_AT_ONCE, dim=1)]
+    return torch.nan_to_num(torch.cat(returns, dim=1), nan=-math.inf, posinf=-math.inf)
+
+
+def _imagine(model: Model, reward_fn: RewardFn, obs: Tensor, actions: Tensor) -> Tensor:
     state = obs[:, None].expand(-1, actions.shape[1], -1)
     total = torch.zeros(actions.shape[:2], device=obs.device)
     for action in actions.unbind(dim=2):
         next_state = model(state, action)
         total = total + reward_fn(state, action, next_state)
         state = next_state
-    return torch.nan_to_num(total, nan=-math.inf, posinf=-math.inf)
+    return total
 
 
 @dataclass(frozen=True)

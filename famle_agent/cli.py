@@ -1,0 +1,108 @@
+"""``famle demo | meta-learn | run``."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import gymnasium as gym
+import tyro
+from rich.console import Console
+
+from famle_agent.demo import run_demo, run_episode
+from famle_agent.errors import NotLearnedError
+from famle_agent.famle import FAMLE
+from famle_agent.wrapper import FAMLEWrapper
+
+__all__ = ["main"]
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Meta-learn a robot from scratch, break it, and watch it adapt."""
+
+    robot: str = "reacher"
+    """The robot."""
+    situation: str = "paper"
+    """What breaks: a preset or a description such as "joint 0 reversed, joint 3 dead"."""
+    episodes: int = 5
+    """Episodes after the break."""
+    out: Path = Path("demo")
+    """Folder for the results."""
+    seed: int = 0
+    """Seed of everything."""
+    meta_iterations: int | None = None
+    """Iterations of the meta-learning; fewer are faster and worse."""
+
+    def __call__(self) -> None:
+        """Runs the demo."""
+        overrides = {} if self.meta_iterations is None else {"meta_iterations": self.meta_iterations}
+        run_demo(self.robot, self.situation, self.episodes, self.out, self.seed, **overrides)
+
+
+@dataclass(frozen=True)
+class MetaLearn:
+    """Meta-learn an agent over its training situations and save it."""
+
+    robot: str = "reacher"
+    """A robot, or a Gymnasium id whose environment names its training situations."""
+    out: Path = Path("agent.zip")
+    """Where the agent goes."""
+    mode: str = "ours"
+    """"ours" or "paper"."""
+    seed: int = 0
+    """Seed of everything."""
+    tensorboard: Path | None = None
+    """Folder for TensorBoard."""
+
+    def __call__(self) -> None:
+        """Meta-learns and saves."""
+        log = None if self.tensorboard is None else str(self.tensorboard)
+        agent = FAMLE(self.robot, self.mode, seed=self.seed, tensorboard_log=log)
+        agent.meta_learn(progress_bar=True).save(self.out)
+        Console().print(f"Saved {self.out}.")
+
+
+@dataclass(frozen=True)
+class Run:
+    """Run a saved agent on a broken robot, adapting."""
+
+    agent: Annotated[Path, tyro.conf.Positional]
+    """The file of the agent."""
+    situation: str = "intact"
+    """What is wrong with the robot."""
+    episodes: int = 5
+    """Episodes to run."""
+    seed: int = 0
+    """Seed of the environment and the planner."""
+
+    def __call__(self) -> None:
+        """Runs the episodes and prints their returns."""
+        agent = FAMLE.load(self.agent)
+        agent.set_random_seed(self.seed)
+        spec = agent.get_env().get_attr("spec")[0]  # type: ignore[union-attr]
+        env = FAMLEWrapper(gym.make(spec.id, **{**spec.kwargs, "situation": self.situation}), agent)
+        for i in range(self.episodes):
+            episode = run_episode(env, self.seed if i == 0 else None)
+            Console().print(
+                f"episode {i}: return {episode.total:.1f}, believes {episode.situation} ({episode.probability:.0%})"
+            )
+        env.close()
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point of the command ``famle``.
+
+    Args:
+        args: The command line without the program's name; None takes the process's own.
+    """
+    command: Demo | MetaLearn | Run = tyro.extras.subcommand_cli_from_dict(
+        {"demo": Demo, "meta-learn": MetaLearn, "run": Run}, args=args, prog="famle"
+    )
+    try:
+        command()
+    except (ValueError, TypeError, FileNotFoundError, NotLearnedError) as error:
+        Console(stderr=True).print(f"[red]famle:[/red] {error}")
+        sys.exit(2)
