@@ -19,7 +19,7 @@ from tqdm import tqdm
 __all__ = ["Replicate", "Result", "load_results", "provenance", "run_replicates", "write_json"]
 
 Result = dict[str, Any]
-_PACKAGES = ("famle", "gymnasium", "numpy", "pybullet", "stable-baselines3", "torch")
+_PACKAGES = ("famle", "gymnasium", "matplotlib", "numpy", "pybullet", "scipy", "stable-baselines3", "torch")
 
 
 @dataclass(frozen=True)

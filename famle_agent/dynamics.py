@@ -200,7 +200,9 @@ class Dynamics(nn.Module):
         """Sets the Gaussian's deviations to their maximum-likelihood values on the training situations."""
         theta = expand(self.parameters_by_name(), self.n_situations)
         residual = self.forward(self.network(theta, self.embeddings), batch.x) - batch.y
-        self.noise_std.copy_(residual.square().mean(dim=(0, 1)).sqrt().clamp(min=_MIN_STD))
+        weight = batch.weight[..., None]
+        variance = (residual.square() * weight).sum(dim=(0, 1)) / weight.sum()
+        self.noise_std.copy_(variance.sqrt().clamp(min=_MIN_STD))
 
     def simulator(self, theta: Theta, h: Tensor) -> Simulator:
         """B models of fixed situation for planning, with the normalisation folded into their outer layers."""

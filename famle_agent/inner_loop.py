@@ -59,5 +59,5 @@ class InnerLoop:
                 loss.sum().backward()  # type: ignore[no-untyped-call]
                 optimizer.step()
                 losses.append(loss.detach())
-        history = torch.stack(losses) if losses else torch.empty(0, len(h))
+        history = torch.stack(losses) if losses else h.new_empty(0, len(h))
         return {name: value.detach() for name, value in theta.items()}, h.detach(), history

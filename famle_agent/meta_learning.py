@@ -67,8 +67,13 @@ class Reptile:
             inner_loop: U^k.
             generator: Source of all the chance.
             callback: Called after each iteration; returning False ends meta-learning.
+
+        Raises:
+            ValueError: There are not as many situations in the data as embeddings in the model.
         """
         n_situations = model.n_situations
+        if len(data.x) != n_situations:
+            raise ValueError(f"The model has {n_situations} embeddings, the data {len(data.x)} situations; make them equal.")
         meta_batch_size = min(self.meta_batch_size, n_situations)
         for iteration in range(self.iterations):
             c = torch.randperm(n_situations, generator=generator)[:meta_batch_size].to(data.x.device)

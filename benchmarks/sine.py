@@ -1,0 +1,285 @@
+"""The paper's figure 2: a sine wave from three, four and five points, by FAMLE and by MAML.
+
+python -m benchmarks.sine
+
+Sines are y = A sin(x + phase) with A in [0.1, 5], phase in [0, pi] and x in [-5, 5] (Finn et al., 2017). To the
+agent's parts a sine is a robot without actions, whose state x changes by y.
+
+Both methods get the same training sines, the same network, the same number of gradient steps at the test, and with
+the iterations below about the same wall time of meta-learning, which is stored. MAML is second-order, and its outer
+gradient is shortened, without which it did far worse. The settings of the meta-learning were tuned by hand for each
+method, on sines that are neither in the training sets nor in the test sets below. The rates of the steps at the test
+are chosen in each replicate, by each method for itself, on validation sines of its own. No choice is made on a test
+sine.
+
+Each replicate has its own training, validation and test sines and its own initial networks.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from dataclasses import asdict, dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+from scipy.stats import bootstrap, trim_mean
+from torch import Tensor
+
+from benchmarks.harness import Result, provenance, write_json
+from famle_agent.adaptation import Memory, adapt, prior
+from famle_agent.dynamics import Dynamics
+from famle_agent.inner_loop import InnerLoop
+from famle_agent.maml import MAML
+from famle_agent.meta_learning import Reptile
+from famle_agent.plots import style
+
+N_POINTS = (3, 4, 5)
+HIDDEN = (40, 40)  # Finn et al.'s network
+POINTS_PER_SINE = 50  # of a training sine
+TEST_STEPS = 32  # k at the test, for both
+GRID = torch.linspace(-5.0, 5.0, 200)
+
+# At the test: plain gradient descent, its rates chosen among these on the validation sines.
+FAMLE_RATES = tuple(InnerLoop(TEST_STEPS, lr, beta) for lr, beta in product((0.003, 0.01, 0.03), (0.3, 1.0)))
+MAML_RATES = tuple(InnerLoop(TEST_STEPS, lr, embedding_lr=0.0) for lr in (0.01, 0.03, 0.05, 0.1, 0.15, 0.2))
+SELECTION_ONLY = (InnerLoop(steps=0, lr=0.0, embedding_lr=0.0),)
+
+
+@dataclass(frozen=True)
+class Args:
+    """Learns to learn sine waves and compares FAMLE with MAML."""
+
+    replicates: int = 5
+    """Replicates, seeded 0, 1, ..."""
+    train_sines: int = 200
+    """Sines to meta-learn from, N; FAMLE has an embedding of each."""
+    validation_sines: int = 100
+    """Sines on which each method chooses its rates."""
+    test_sines: int = 200
+    """Unseen sines per replicate."""
+    famle_iterations: int = 1000
+    """Iterations of Reptile, of ten inner steps each."""
+    maml_iterations: int = 3000
+    """Iterations of MAML, of two inner steps each; as many as fit the same time."""
+    out: Path = Path("benchmarks/results")
+    """Folder of sine.json and sine.png."""
+
+    def __post_init__(self) -> None:
+        counts = {name: value for name, value in asdict(self).items() if name != "out"}
+        if wrong := [name for name, value in counts.items() if value < 1]:
+            raise ValueError(f"{', '.join(wrong)} must be at least 1.")
+        if self.replicates * self.test_sines < 2:
+            raise ValueError("The bootstrap needs at least two test sines: raise replicates or test_sines.")
+
+
+@dataclass(frozen=True)
+class Sines:
+    """B sine waves.
+
+    Attributes:
+        amplitude: A, (B, 1).
+        phase: In rad, (B, 1).
+    """
+
+    amplitude: Tensor
+    phase: Tensor
+
+    @classmethod
+    def sample(cls, size: int, generator: torch.Generator) -> Sines:
+        """Draws sines as Finn et al. do."""
+        amplitude = 0.1 + 4.9 * torch.rand(size, 1, generator=generator)
+        return cls(amplitude, math.pi * torch.rand(size, 1, generator=generator))
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """The sines' values y, (B, n), at x of (B, n) or (n,)."""
+        return self.amplitude * torch.sin(x + self.phase)
+
+    def observe(self, n: int, generator: torch.Generator) -> Memory:
+        """The transitions x -> x + y at n random places on each sine."""
+        x = 10.0 * torch.rand(len(self.phase), n, generator=generator) - 5.0
+        obs, next_obs = x[..., None], (x + self(x))[..., None]
+        return Memory(obs, torch.zeros(*x.shape, 0), next_obs, torch.ones_like(x))
+
+
+@dataclass(frozen=True)
+class Learner:
+    """A meta-trained model and how it adapts.
+
+    Attributes:
+        model: Holds theta_meta and H_meta.
+        inner_loop: The steps at the test.
+        seconds: Wall time of the meta-learning.
+    """
+
+    model: Dynamics
+    inner_loop: InnerLoop
+    seconds: float
+
+    def fit(self, points: Memory) -> Tensor:
+        """Algorithm 2's lines 6 and 7, then y on GRID for each of B sines, (B, 200)."""
+        sines = len(points.weight)
+        belief = adapt(self.model, points, self.inner_loop, prior(self.model, sines))
+        x = GRID.expand(sines, -1)[..., None]
+        simulator = self.model.simulator(belief.theta, belief.h)
+        return (simulator(x, torch.zeros(sines, len(GRID), 0)) - x)[..., 0].detach()
+
+    def errors(self, sines: Sines, points: Memory) -> Tensor:
+        """Mean squared error over GRID with the first 3, 4 and 5 points, (3, B); infinite where the steps diverged."""
+        errors = [(self.fit(first(points, n)) - sines(GRID)).square().mean(dim=1) for n in N_POINTS]
+        return torch.stack(errors).nan_to_num(nan=math.inf)
+
+
+def first(points: Memory, n: int) -> Memory:
+    """The first n points of each sine."""
+    return Memory(points.obs[:, :n], points.action[:, :n], points.next_obs[:, :n], points.weight[:, :n])
+
+
+def interquartile_mean(values: NDArray[np.float64], axis: int = -1) -> NDArray[np.float64]:
+    """Mean of the middle half."""
+    return np.asarray(trim_mean(values, 0.25, axis=axis))
+
+
+def meta_learn(learn: Reptile | MAML, data: Memory, n_situations: int, inner_loop: InnerLoop, seed: int) -> Learner:
+    """Meta-trains a fresh model of ``n_situations`` embeddings."""
+    torch.manual_seed(seed)
+    model = Dynamics(1, 0, n_situations, embedding_dim=4, hidden=HIDDEN, gate_actions=False)
+    model.fit_normalisation(data.obs, data.next_obs)
+    start = time.perf_counter()
+    # The model's noise stays 1: of a single target, its size does not change which embedding is most likely.
+    batch = model.encode(data.obs, data.action, data.next_obs)
+    learn(model, batch, inner_loop, torch.Generator().manual_seed(seed))
+    return Learner(model, inner_loop, time.perf_counter() - start)
+
+
+def choose_rates(learner: Learner, rates: tuple[InnerLoop, ...], sines: Sines, points: Memory) -> Learner:
+    """The learner with the rates of the least interquartile mean error over all validation fits."""
+
+    def error(candidate: Learner) -> float:
+        return float(interquartile_mean(candidate.errors(sines, points).double().numpy().ravel()))
+
+    return min((Learner(learner.model, inner_loop, learner.seconds) for inner_loop in rates), key=error)
+
+
+def learners(args: Args, seed: int, generator: torch.Generator) -> dict[str, Learner]:
+    """Meta-trains both methods on the same sines, and lets them choose their rates."""
+    data = Sines.sample(args.train_sines, generator).observe(POINTS_PER_SINE, generator)
+    validation = Sines.sample(args.validation_sines, generator)
+    points = validation.observe(max(N_POINTS), generator)
+
+    reptile = Reptile(
+        args.famle_iterations, meta_lr=1.0, embedding_meta_lr=1.0, meta_batch_size=25, batch_size=POINTS_PER_SINE // 2
+    )
+    steps = InnerLoop(steps=10, lr=0.005, embedding_lr=0.05, optimizer="adam")
+    famle = meta_learn(reptile, data, args.train_sines, steps, seed)
+
+    maml = MAML(args.maml_iterations, meta_lr=0.01, meta_batch_size=25, batch_size=max(N_POINTS), query_size=20)
+    rival = meta_learn(maml, data, 1, InnerLoop(steps=2, lr=0.1, embedding_lr=0.0), seed)
+
+    return {
+        "FAMLE": choose_rates(famle, FAMLE_RATES, validation, points),
+        "MAML": choose_rates(rival, MAML_RATES, validation, points),
+        "selection only": choose_rates(famle, SELECTION_ONLY, validation, points),
+    }
+
+
+def summary(errors: list[NDArray[np.float64]]) -> Result:
+    """Statistics of the errors of one method with one number of points; an array a replicate.
+
+    The interval is over the test sines, with the meta-trained models as they are.
+    """
+    pooled = np.concatenate(errors)
+    lower, median, upper = np.quantile(pooled, (0.25, 0.5, 0.75))
+    interval = bootstrap(
+        (pooled,), interquartile_mean, n_resamples=2000, method="percentile", rng=np.random.default_rng(0)
+    ).confidence_interval
+    return {
+        "median": float(median),
+        "quartiles": [float(lower), float(upper)],
+        "iqm": float(interquartile_mean(pooled)),
+        "iqm_interval": [float(interval.low), float(interval.high)],
+        "iqm_per_replicate": [float(interquartile_mean(values)) for values in errors],
+    }
+
+
+def table(statistics: dict[str, dict[str, Result]], title: str) -> Table:
+    """The statistics by number of points and method."""
+    result = Table("points", "method", "median", "quartiles", "IQM", "95 % interval", title=title)
+    for n in map(str, N_POINTS):
+        for method, by_points in statistics.items():
+            row = by_points[n]
+            pairs = [" to ".join(f"{bound:.3f}" for bound in row[key]) for key in ("quartiles", "iqm_interval")]
+            result.add_row(n, method, f"{row['median']:.3f}", pairs[0], f"{row['iqm']:.3f}", pairs[1])
+        result.add_section()
+    return result
+
+
+def picture(by_method: dict[str, Learner], sines: Sines, points: Memory, i: int, path: Path) -> None:
+    """Draws the fits of sine ``i`` with three, four and five points."""
+    figure = Figure(figsize=(9.6, 2.9), layout="constrained")
+    panels = figure.subplots(1, len(N_POINTS), sharey=True)
+    for axes, n in zip(panels, N_POINTS, strict=True):
+        seen = first(points, n)
+        axes.plot(GRID, sines(GRID)[i], color="0.6", linewidth=3, label="truth")
+        for method, color, dashes in (("FAMLE", "C0", "-"), ("MAML", "C3", "--")):
+            axes.plot(GRID, by_method[method].fit(seen)[i], color=color, linestyle=dashes, label=method)
+        axes.plot(seen.obs[i], (seen.next_obs - seen.obs)[i], "ko", markersize=5, label="points", zorder=3)
+        style(axes, "x", "y" if n == N_POINTS[0] else "", f"{n} points")
+    panels[0].legend(fontsize="small")
+    figure.savefig(path, dpi=120)
+
+
+def replicate(args: Args, seed: int) -> tuple[dict[str, NDArray[np.float64]], list[Result]]:
+    """One seed: the errors of each method, (3, test_sines), and the learners' settings."""
+    generator = torch.Generator().manual_seed(seed)
+    by_method = learners(args, seed, generator)
+    test = Sines.sample(args.test_sines, generator)
+    points = test.observe(max(N_POINTS), generator)
+    errors = {method: learner.errors(test, points).double().numpy() for method, learner in by_method.items()}
+    if seed == 0:
+        # The sine of the median ratio of the errors: neither method's showpiece.
+        typical = int((errors["FAMLE"] / errors["MAML"])[1].argsort()[args.test_sines // 2])
+        picture(by_method, test, points, typical, args.out / "sine.png")
+    settings = [
+        {"seed": seed, "method": method, "rates": asdict(learner.inner_loop), "meta_learning_seconds": learner.seconds}
+        for method, learner in by_method.items()
+    ]
+    return errors, settings
+
+
+def main(args: Args) -> None:
+    """Runs all replicates, prints the table, and stores it with a picture of one test sine."""
+    torch.set_num_threads(1)
+    start = time.perf_counter()
+    args.out.mkdir(parents=True, exist_ok=True)
+    errors, settings = zip(*(replicate(args, seed) for seed in range(args.replicates)), strict=True)
+
+    statistics = {
+        method: {str(n): summary([by_method[method][i] for by_method in errors]) for i, n in enumerate(N_POINTS)}
+        for method in errors[0]
+    }
+    better = np.concatenate([by_method["FAMLE"] < by_method["MAML"] for by_method in errors], axis=1).mean(axis=1)
+    title = f"Mean squared error over x, {args.replicates} replicates of {args.test_sines} unseen sines"
+    Console().print(table(statistics, title))
+    result = {
+        "title": title,
+        "args": asdict(args) | {"out": str(args.out)},
+        "seeds": list(range(args.replicates)),
+        "mean_squared_error": statistics,
+        "famle_better_than_maml": {str(n): float(share) for n, share in zip(N_POINTS, better, strict=True)},
+        "learners": [learner for of_seed in settings for learner in of_seed],
+        "wall_seconds": time.perf_counter() - start,
+    }
+    write_json(args.out / "sine.json", result | provenance(sys.argv))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

@@ -1,0 +1,132 @@
+"""MAML (Finn et al., 2017; the paper's eq. 3 to 5): gradient-based meta-learning of one starting point theta.
+
+The rival of Algorithm 1. It has no embedding of the situation, so that all that tells one situation from another
+has to come from the k gradient steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from famle_agent.dynamics import Batch, Dynamics, Theta, expand
+from famle_agent.inner_loop import InnerLoop
+from famle_agent.meta_learning import MetaStep
+
+__all__ = ["MAML"]
+
+
+@dataclass(frozen=True)
+class MAML:
+    """Meta-learns theta such that k gradient steps on a few transitions fit the others of the same situation.
+
+    Attributes:
+        iterations: Number of meta-iterations.
+        meta_lr: Rate of the outer Adam; decays linearly to 0.
+        meta_batch_size: Situations per iteration.
+        batch_size: Transitions the inner steps see, the same ones in each step, as after the deployment.
+        query_size: Other transitions of the same situation, which judge the adapted parameters.
+        first_order: Whether the inner steps count as a constant shift of theta (eq. 5 instead of eq. 4).
+        max_grad_norm: The outer gradient is shortened to this length.
+    """
+
+    iterations: int
+    meta_lr: float
+    meta_batch_size: int
+    batch_size: int
+    query_size: int
+    first_order: bool = False
+    max_grad_norm: float = 1.0
+
+    @torch.enable_grad()
+    def __call__(
+        self,
+        model: Dynamics,
+        data: Batch,
+        inner_loop: InnerLoop,
+        generator: torch.Generator,
+        callback: Callable[[MetaStep], bool] = lambda _: True,
+    ) -> None:
+        """Runs MAML on ``model`` in place.
+
+        Args:
+            model: Randomly initialised model of one embedding, which stays as it is; its theta becomes the
+                meta-trained one.
+            data: Encoded transitions of N situations.
+            inner_loop: U^k, by stochastic gradient descent on theta alone.
+            generator: Source of all the chance.
+            callback: Called after each iteration with the mean loss on the inner steps' own data before them, and on
+                the other data after them; returning False ends meta-learning.
+
+        Raises:
+            ValueError: If the model, the data or the update rule do not fit.
+        """
+        self._check(model, data, inner_loop)
+        n_situations = len(data.x)
+        meta_batch_size = min(self.meta_batch_size, n_situations)
+        h = model.embeddings.detach().expand(meta_batch_size, -1)
+        optimizer = torch.optim.Adam(model.theta.parameters(), lr=self.meta_lr, foreach=True)
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda done: 1.0 - done / self.iterations)
+        for iteration in range(self.iterations):
+            c = torch.randperm(n_situations, generator=generator)[:meta_batch_size].to(data.x.device)
+            support, query = self._sample(data, c, generator)
+
+            theta = expand(dict(model.theta.items()), meta_batch_size)
+            theta_tilde, loss_before = self._adapt(model, theta, h, support, inner_loop)
+            loss_after = model.loss(theta_tilde, h, query).mean()
+
+            optimizer.zero_grad()
+            torch.autograd.backward(loss_after)
+            # Where the inner steps nearly diverge, a few situations' gradients would drown all the others.
+            torch.nn.utils.clip_grad_norm_(model.theta.parameters(), self.max_grad_norm)
+            optimizer.step()
+            schedule.step()
+
+            if not callback(MetaStep(iteration + 1, c, loss_before.mean().item(), loss_after.item())):
+                return
+
+    def _adapt(
+        self, model: Dynamics, theta: Theta, h: Tensor, support: Batch, inner_loop: InnerLoop
+    ) -> tuple[Theta, Tensor]:
+        """theta~ = U^k(theta) as a function of theta, to be differentiated, and the loss before it, (B,)."""
+        losses = []
+        for _ in range(inner_loop.steps):
+            loss = model.loss(theta, h, support)
+            # Without a graph of their own, the gradients are constants: theta~ = theta + b, eq. 5.
+            gradients = torch.autograd.grad(loss.sum(), list(theta.values()), create_graph=not self.first_order)
+            theta = {
+                name: value - inner_loop.lr * gradient
+                for (name, value), gradient in zip(theta.items(), gradients, strict=True)
+            }
+            losses.append(loss.detach())
+        return theta, losses[0]
+
+    def _sample(self, data: Batch, c: Tensor, generator: torch.Generator) -> tuple[Batch, Batch]:
+        """Transitions of each situation in ``c`` for the inner steps, and others to judge them by."""
+        order = torch.rand(len(c), data.x.shape[1], generator=generator).argsort(dim=1).to(data.x.device)
+        support, query, _ = order.tensor_split([self.batch_size, self.batch_size + self.query_size], dim=1)
+        c = c[:, None]
+        return (
+            Batch(data.x[c, support], data.y[c, support], data.weight[c, support]),
+            Batch(data.x[c, query], data.y[c, query], data.weight[c, query]),
+        )
+
+    def _check(self, model: Dynamics, data: Batch, inner_loop: InnerLoop) -> None:
+        if model.n_situations != 1:
+            raise ValueError(
+                f"MAML has no use for embeddings, but the model has {model.n_situations}: build it with n_situations=1."
+            )
+        if inner_loop.optimizer != "sgd" or inner_loop.embedding_lr != 0 or inner_loop.steps < 1:
+            raise ValueError(
+                "MAML differentiates through at least one step of gradient descent on theta alone: "
+                f'use steps >= 1, optimizer="sgd" and embedding_lr=0 instead of {inner_loop}.'
+            )
+        n, needed = data.x.shape[1], self.batch_size + self.query_size
+        if n < needed:
+            raise ValueError(
+                f"MAML needs batch_size + query_size = {needed} different transitions of each situation, "
+                f"but there are {n}: give more data or take smaller batches."
+            )
