@@ -91,7 +91,7 @@ def prior(model: Dynamics, robots: int) -> Belief:
 
 
 @torch.no_grad()
-def adapt(model: Dynamics, memory: Memory, inner_loop: InnerLoop, belief: Belief, decay: float = 1.0) -> Belief:
+def adapt(model: Dynamics, memory: Memory, inner_loop: InnerLoop, belief: Belief) -> Belief:
     """Lines 6 and 7 of Algorithm 2 for B robots at once.
 
     Args:
@@ -99,11 +99,8 @@ def adapt(model: Dynamics, memory: Memory, inner_loop: InnerLoop, belief: Belief
         memory: D_M.
         inner_loop: k steps of gradient descent.
         belief: The belief until now; of it only the number of adaptations lives on.
-        decay: Factor on the weight of a transition per step of its age: with 1, the paper's, all of the memory counts
-            alike; below 1, a robot that has just broken is believed sooner.
     """
-    weight = memory.weight * decay ** torch.arange(memory.weight.shape[1] - 1, -1, -1, device=memory.weight.device)
-    data = model.encode(memory.obs, memory.action, memory.next_obs, weight)
+    data = model.encode(memory.obs, memory.action, memory.next_obs, memory.weight)
     log_likelihood = situation_log_likelihood(model, data)
     h_likely = model.embeddings[log_likelihood.argmax(dim=1)]
     theta_meta = expand(model.parameters_by_name(), len(h_likely))

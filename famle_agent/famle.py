@@ -46,5 +46,4 @@ class FAMLE(ModelBasedAgent):
 
     def _adapt(self, memory: Memory, belief: Belief) -> Belief:
         """Algorithm 2, lines 6 and 7: the most likely embedding, then k gradient steps on theta and h."""
-        settings = self.hyperparameters
-        return adapt(self._require_dynamics(), memory, settings.adaptation(), belief, settings.memory_decay)
+        return adapt(self._require_dynamics(), memory, self.hyperparameters.adaptation(), belief)

@@ -41,7 +41,6 @@ class Hyperparameters:
         meta_batch_size: Situations per iteration of Algorithm 1; the paper's is 1.
         adapt_every: K, robot steps between two adaptations; 0 never adapts.
         memory_size: M, transitions that adaptation looks back on.
-        memory_decay: Factor on a transition's weight per step of its age, in (0, 1]; the paper's is 1.
         adapt_steps: k of online adaptation; None takes ``inner_steps``, 0 only selects an embedding.
         adapt_lr: alpha of online adaptation; None takes ``inner_lr``.
         adapt_embedding_lr: beta of online adaptation; None takes ``embedding_lr``.
@@ -75,7 +74,6 @@ class Hyperparameters:
     meta_batch_size: int = 20
     adapt_every: int = 5
     memory_size: int = 50
-    memory_decay: float = 1.0
     adapt_steps: int | None = None
     adapt_lr: float | None = None
     adapt_embedding_lr: float | None = None
@@ -95,8 +93,6 @@ class Hyperparameters:
             value = getattr(self, name)
             if value is not None and not value >= least:
                 raise ValueError(f"{name} must be at least {least}, got {value!r}.")
-        if not 0.0 < self.memory_decay <= 1.0:
-            raise ValueError(f"memory_decay must lie in (0, 1], got {self.memory_decay}.")
         if not self.hidden or min(self.hidden) < 1:
             raise ValueError(f"hidden must name the width of at least one layer, got {self.hidden}.")
         for name, choices in _CHOICES.items():

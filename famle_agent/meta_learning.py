@@ -73,7 +73,9 @@ class Reptile:
         """
         n_situations = model.n_situations
         if len(data.x) != n_situations:
-            raise ValueError(f"The model has {n_situations} embeddings, the data {len(data.x)} situations; make them equal.")
+            raise ValueError(
+                f"The model has {n_situations} embeddings, the data {len(data.x)} situations; make them equal."
+            )
         meta_batch_size = min(self.meta_batch_size, n_situations)
         for iteration in range(self.iterations):
             c = torch.randperm(n_situations, generator=generator)[:meta_batch_size].to(data.x.device)

@@ -51,6 +51,8 @@ class BulletEnv(gym.Env[Array, Array]):
     """Duration of one physics step, in s."""
     physics_steps: ClassVar[int]
     """Physics steps per control step."""
+    solver_iterations: ClassVar[int] = 200
+    """Of PyBullet's constraint solver; with its own 50, motors of a chain of links disturb each other."""
     angle_dims: ClassVar[tuple[int, ...]] = ()
     """Observation dimensions that are angles in [-pi, pi], where pi and -pi are the same place."""
     training_situations: ClassVar[tuple[Situation, ...]]
@@ -76,6 +78,7 @@ class BulletEnv(gym.Env[Array, Array]):
         self._situation = self._resolve(situation)
         self._client: int | None = None
         self._locked_at: dict[int, float] = {}
+        self._obs: Array | None = None
         self._load()
 
     @property
@@ -142,8 +145,11 @@ class BulletEnv(gym.Env[Array, Array]):
         """Applies an action for one control period.
 
         Raises:
+            ResetNeeded: There was no reset yet.
             ValueError: The action has the wrong shape or is not finite. It is clipped to the action space.
         """
+        if self._obs is None:
+            raise gym.error.ResetNeeded("Call reset() before step().")
         action = np.asarray(action, dtype=np.float64)
         if action.shape != self.action_space.shape or not np.isfinite(action).all():
             raise ValueError(f"The action must be {self.action_space.shape} finite numbers, got {action}.")
@@ -178,6 +184,16 @@ class BulletEnv(gym.Env[Array, Array]):
             pybullet.disconnect(physicsClientId=self._client)
             self._client = None
 
+    def __del__(self) -> None:
+        # A world that nobody closes would keep its memory until the process ends.
+        if getattr(self, "_client", None) is not None:
+            self.close()
+
+    @property
+    def control_period(self) -> float:
+        """Duration of one control step, in s."""
+        return self.time_step * self.physics_steps
+
     @property
     def _world(self) -> int:
         if self._client is None:
@@ -185,15 +201,21 @@ class BulletEnv(gym.Env[Array, Array]):
         return self._client
 
     def _load(self) -> None:
-        self._client = pybullet.connect(pybullet.DIRECT)
-        client = self._client
+        client = pybullet.connect(pybullet.DIRECT)
+        if client < 0:
+            raise RuntimeError("PyBullet gives no more physics worlds; close() environments that are not needed.")
+        self._client = client
         # Sleeping and unordered contact pairs would make a run depend on the runs before it.
         pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=self.time_step, deterministicOverlappingPairs=1, physicsClientId=client
+            fixedTimeStep=self.time_step,
+            numSolverIterations=self.solver_iterations,
+            deterministicOverlappingPairs=1,
+            physicsClientId=client,
         )
         pybullet.setGravity(0.0, 0.0, -9.81, physicsClientId=client)
         with as_file(files("famle_envs") / "assets" / self.asset) as path:
             self._robot = self._load_robot(str(path), client)
+        self.joint_limits = self._read_joint_limits()
         self._colours = {
             shape[1]: shape[7] for shape in pybullet.getVisualShapeData(self._robot, physicsClientId=client)
         }
@@ -202,6 +224,13 @@ class BulletEnv(gym.Env[Array, Array]):
     @abstractmethod
     def _load_robot(self, path: str, client: int) -> int:
         """Loads the robot and all that stands around it, in the start pose; returns the robot's body."""
+
+    def _read_joint_limits(self) -> Array:
+        """Lower and upper end of each joint in rad, (2, n_joints); infinite for a joint that turns without end."""
+        info = [pybullet.getJointInfo(self._robot, joint, physicsClientId=self._world) for joint in self.joints]
+        # PyBullet says "no limit" by a lower end above the upper one.
+        ends = [(lower, upper) if lower <= upper else (-np.inf, np.inf) for lower, upper in (row[8:10] for row in info)]
+        return np.array(ends).T
 
     def _apply_situation(self) -> None:
         states = pybullet.getJointStates(self._robot, self.joints, physicsClientId=self._world)

@@ -88,7 +88,10 @@ class ReacherEnv(BulletEnv):
         situation: Situation | Mapping[str, Any] | str | None = None,
         render_mode: str | None = None,
     ) -> None:
-        point = np.asarray(goal, dtype=np.float64)
+        try:
+            point = np.asarray(goal, dtype=np.float64)
+        except (TypeError, ValueError):
+            point = np.empty(0)
         if point.shape != (2,) or not np.isfinite(point).all():
             raise ValueError(f"goal must be two finite numbers, x and y in m, got {goal!r}.")
         self.goal = (float(point[0]), float(point[1]))
@@ -153,12 +156,15 @@ class ReacherEnv(BulletEnv):
         return int(robot)
 
     def _actuate(self, action: Array) -> None:
-        gain = np.asarray(self._situation.motor_gain)
+        speed = MAX_SPEED * np.clip(np.multiply(self._situation.motor_gain, action), -1.0, 1.0)
+        # A servo stops at its joint's end. One that pushed on against it would turn the whole arm in this simulator.
+        states = pybullet.getJointStates(self._robot, self.joints, physicsClientId=self._world)
+        lower, upper = (self.joint_limits - np.array([state[0] for state in states])) / self.control_period
         pybullet.setJointMotorControlArray(
             self._robot,
             self.joints,
             pybullet.VELOCITY_CONTROL,
-            targetVelocities=(MAX_SPEED * np.clip(gain * action, -1.0, 1.0)).tolist(),
+            targetVelocities=np.clip(speed, lower, upper).tolist(),
             forces=[MAX_FORCE] * N_JOINTS,
             physicsClientId=self._world,
         )

@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 __all__ = ["Situation", "resolve_situation"]
@@ -25,6 +26,10 @@ _CLAUSES = {
     "friction": re.compile(rf"friction x {_NUMBER}"),
     "base_mass": re.compile(rf"base mass x {_NUMBER}"),
 }
+
+
+class UnreadableError(ValueError):
+    """A text is no description of a situation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,8 +143,11 @@ class Situation:
         """Builds a situation from a mapping of field names to values.
 
         Raises:
-            ValueError: A key is not a field of a situation.
+            TypeError: It is no mapping, or a value is of the wrong type.
+            ValueError: A key is not a field of a situation, or a value is out of range.
         """
+        if not isinstance(mapping, Mapping):
+            raise TypeError(f"Expected a mapping of a situation's fields, got {type(mapping).__name__}.")
         known = [f.name for f in dataclasses.fields(cls)]
         for key in mapping:
             if key not in known:
@@ -155,26 +163,32 @@ class Situation:
         The tuples end at the last joint mentioned; :meth:`for_robot` completes them.
 
         Raises:
-            ValueError: A clause cannot be read.
+            TypeError: It is no string.
+            ValueError: A clause cannot be read, contradicts another one, or says an impossible value.
         """
+        if not isinstance(text, str):
+            raise TypeError(f"Expected a description such as 'joint 3 dead', got {type(text).__name__}.")
+        clauses = [clause.strip() for clause in text.split(",")]
+        if clauses == ["intact"]:
+            return cls()
         gain: dict[int, float] = {}
         offset: dict[int, float] = {}
         locked: list[int] = []
         scalars: dict[str, float] = {}
-        for clause in (part.strip() for part in text.split(",")):
+        for clause in clauses:
             kind, groups = _match(clause)
             if kind in _GAIN_OF_WORD:
-                gain[int(groups[0])] = _GAIN_OF_WORD[kind]
+                _say(gain, _joint(groups[0]), _GAIN_OF_WORD[kind], clause)
             elif kind == "gain":
-                gain[int(groups[0])] = float(groups[1])
+                _say(gain, _joint(groups[0]), float(groups[1]), clause)
             elif kind == "locked":
-                locked.append(int(groups[0]))
+                locked.append(_joint(groups[0]))
             elif kind == "offset":
-                offset[int(groups[0])] = _radians(groups[1], groups[2])
+                _say(offset, _joint(groups[0]), _radians(groups[1], groups[2]), clause)
             elif kind == "yaw":
-                scalars["orientation_error"] = _radians(groups[0], groups[1])
-            elif kind != "intact":
-                scalars[kind] = float(groups[0])
+                _say(scalars, "orientation_error", _radians(groups[0], groups[1]), clause)
+            else:
+                _say(scalars, kind, float(groups[0]), clause)
         tuples = {"motor_gain": _dense(gain, 1.0), "locked_joints": tuple(locked), "joint_offset": _dense(offset, 0.0)}
         return cls.from_dict({**tuples, **scalars})
 
@@ -195,7 +209,9 @@ class Situation:
             )
         for name in ("motor_gain", "joint_offset"):
             if len(getattr(self, name)) > n_joints:
-                raise ValueError(f"{name} has {len(getattr(self, name))} values but {robot} has {n_joints} joints.")
+                raise ValueError(
+                    f"{name} speaks of {len(getattr(self, name))} joints; those of {robot} are 0 to {n_joints - 1}."
+                )
         if self.locked_joints and self.locked_joints[-1] >= n_joints:
             raise ValueError(
                 f"locked_joints names joint {self.locked_joints[-1]}; the joints of {robot} are 0 to {n_joints - 1}."
@@ -235,7 +251,7 @@ def resolve_situation(
         return presets[situation]
     try:
         return Situation.from_string(situation)
-    except ValueError as error:
+    except UnreadableError as error:
         raise ValueError(
             f"No situation is called {situation!r}{_suggest(situation, list(presets))} Presets: {', '.join(presets)}."
         ) from error
@@ -261,12 +277,22 @@ def _radians(number: str, unit: str) -> float:
 
 
 def _match(clause: str) -> tuple[str, tuple[str, ...]]:
-    if clause == "intact":
-        return "intact", ()
     for kind, pattern in _CLAUSES.items():
         if match := pattern.fullmatch(clause):
             return kind, match.groups()
-    raise ValueError(f"Cannot read {clause!r} as a fault. Write it like 'joint 3 dead' or 'yaw sensor off by 30 deg'.")
+    raise UnreadableError(f"Cannot read {clause!r}. Write faults like 'joint 3 dead, yaw sensor off by 30 deg'.")
+
+
+def _joint(index: str) -> int:
+    if len(index) > 3:
+        raise ValueError(f"No robot has a joint {index}.")
+    return int(index)
+
+
+def _say(values: dict[Any, float], key: Any, value: float, clause: str) -> None:
+    if key in values:
+        raise ValueError(f"{clause!r} contradicts what was said before it; say one thing of each motor and sensor.")
+    values[key] = value
 
 
 def _dense(values: Mapping[int, float], default: float) -> tuple[float, ...]:
@@ -285,21 +311,25 @@ def _strip(values: tuple[float, ...], default: float) -> tuple[float, ...]:
 
 def _wrap(angle: float) -> float:
     """The same angle in (-pi, pi]."""
-    return angle if -math.pi < angle <= math.pi else -((-angle + math.pi) % (2 * math.pi) - math.pi)
+    if not -math.pi < angle <= math.pi:
+        angle = math.remainder(angle, 2 * math.pi)
+    return math.pi if angle <= -math.pi else angle
 
 
 def _float(name: str, value: Any) -> float:
+    if not isinstance(value, Real):
+        raise TypeError(f"{name} must be a number, got {value!r}.")
     try:
         number = float(value)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be a number, got {value!r}.") from error
+    except OverflowError:
+        number = math.inf
     if not math.isfinite(number):
         raise ValueError(f"{name} must be finite, got {number}.")
-    return number + 0.0  # turns -0.0 into 0.0, so that equal values have equal hashes and texts
+    return number
 
 
 def _floats(name: str, values: Sequence[float]) -> tuple[float, ...]:
-    if isinstance(values, (str, bytes)) or not hasattr(values, "__iter__"):
+    if isinstance(values, (str, bytes, Mapping)) or not hasattr(values, "__iter__"):
         raise TypeError(f"{name} must be a sequence with one number per joint, got {values!r}.")
     return tuple(_float(name, value) for value in values)
 
