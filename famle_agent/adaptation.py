@@ -36,6 +36,15 @@ class Memory:
         scalar = torch.zeros(robots, size, device=device)
         return cls(obs, torch.zeros(robots, size, action_dim, device=device), obs, scalar)
 
+    def resized(self, size: int) -> Memory:
+        """The newest ``size`` places, with empty ones in front where there are fewer."""
+
+        def fit(values: Tensor) -> Tensor:
+            empty = values.new_zeros(len(values), size, *values.shape[2:])
+            return torch.cat([empty, values], dim=1)[:, -size:]
+
+        return Memory(fit(self.obs), fit(self.action), fit(self.next_obs), fit(self.weight))
+
     def add(self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor) -> Memory:
         """Inserts one transition per robot where ``valid`` (B,), and drops that robot's oldest."""
 
@@ -72,6 +81,11 @@ class Belief:
         """P(situation | memory) under a uniform prior, (B, N)."""
         return torch.softmax(self.log_likelihood, dim=1)
 
+    def is_finite(self) -> Tensor:
+        """For which robots all parameters are finite numbers, (B,)."""
+        values = [value.flatten(start_dim=1) for value in (*self.theta.values(), self.h)]
+        return torch.cat(values, dim=1).isfinite().all(dim=1)
+
     def where(self, kept: Tensor, other: Belief) -> Belief:
         """This belief for the robots in ``kept`` (B,), and the other one for the rest."""
 
@@ -97,15 +111,16 @@ def adapt(model: Dynamics, memory: Memory, inner_loop: InnerLoop, belief: Belief
     Args:
         model: Holds theta_meta and H_meta.
         memory: D_M.
-        inner_loop: k steps of gradient descent.
+        inner_loop: k steps of gradient descent; where they diverge, theta_meta and the embedding stay.
         belief: The belief until now; of it only the number of adaptations lives on.
     """
     data = model.encode(memory.obs, memory.action, memory.next_obs, memory.weight)
     log_likelihood = situation_log_likelihood(model, data)
     h_likely = model.embeddings[log_likelihood.argmax(dim=1)]
-    theta_meta = expand(model.parameters_by_name(), len(h_likely))
-    theta, h, _ = inner_loop(model, theta_meta, h_likely, lambda: data)
-    return replace(belief, theta=theta, h=h, log_likelihood=log_likelihood, adaptations=belief.adaptations + 1)
+    start = Belief(expand(model.parameters_by_name(), len(h_likely)), h_likely, log_likelihood, belief.adaptations + 1)
+    theta, h, _ = inner_loop(model, start.theta, start.h, lambda: data)
+    adapted = replace(start, theta=theta, h=h)
+    return adapted.where(adapted.is_finite(), start)  # steps that diverged are no steps
 
 
 @torch.no_grad()
@@ -122,4 +137,5 @@ def situation_log_likelihood(model: Dynamics, data: Batch) -> Tensor:
     )
     theta = expand(model.parameters_by_name(), situations)
     log_p = model.log_likelihood(theta, model.embeddings, rows)
-    return log_p.view(situations, robots, n).sum(dim=2).T
+    # An observation beyond all measure would make every likelihood -inf and the posterior meaningless.
+    return log_p.view(situations, robots, n).sum(dim=2).T.clamp(min=-1e30)

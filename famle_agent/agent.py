@@ -99,7 +99,10 @@ class ModelBasedAgent(BaseAlgorithm):
         )
         self.mode = mode
         self.situations: tuple[str, ...] = ()
-        self._env_spec = None if self.env is None else env_spec(self.env)
+        self._env_spec: dict[str, Any] | None = None
+        self._env_reward_fn: RewardFn | None = None
+        if self.env is not None:
+            self._describe_env(self.env)
         robot = robot_of(self._env_spec["id"] if self._env_spec else None)
         self.hyperparameters = robot.hyperparameters(mode, **overrides)
         self.planner = self.hyperparameters.make_planner()
@@ -108,6 +111,8 @@ class ModelBasedAgent(BaseAlgorithm):
         if angle_dims is None:
             angle_dims = () if self.env is None else env_attribute(self.env, "angle_dims", ())
         self._angle_dims = tuple(angle_dims)
+        if self.env is not None and any(not 0 <= dim < self.observation_space.shape[0] for dim in self._angle_dims):
+            raise ValueError(f"angle_dims {self._angle_dims} name dimensions that {self.observation_space} has not.")
         self._live: OnlineState | None = None
         self._served: object = None
         self._generator = torch.Generator(self.device)
@@ -135,6 +140,13 @@ class ModelBasedAgent(BaseAlgorithm):
         wrapped = self._wrap_env(env, self.verbose)
         self.n_envs = wrapped.num_envs
         super().set_env(wrapped, force_reset)
+        self._describe_env(wrapped)
+
+    def _describe_env(self, env: VecEnv) -> None:
+        if self._vec_normalize_env is not None:
+            raise ValueError("The model normalises by itself; give the environment without VecNormalize.")
+        self._env_spec = env_spec(env)
+        self._env_reward_fn = env_attribute(env, "reward_fn", None)
 
     # --- what a subclass adds ---------------------------------------------------------------------------
 
@@ -306,11 +318,13 @@ class ModelBasedAgent(BaseAlgorithm):
         return self
 
     def _log_episodes(self, state: OnlineState, ended: int, log_interval: int) -> None:
+        logged = self._episode_num // log_interval
         self._episode_num += ended
-        if not ended or self._episode_num % log_interval != 0:
+        if self._episode_num // log_interval == logged:
             return
         if self.ep_info_buffer:
             self.logger.record("rollout/ep_rew_mean", safe_mean([info["r"] for info in self.ep_info_buffer]))
+            self.logger.record("rollout/ep_len_mean", safe_mean([info["l"] for info in self.ep_info_buffer]))
             self.logger.record("rollout/ep_rew_last", self.ep_info_buffer[-1]["r"])
         posterior = self.posterior(state)
         self.logger.record("adapt/situation", max(posterior, key=lambda name: posterior[name]), exclude="tensorboard")
@@ -337,7 +351,8 @@ class ModelBasedAgent(BaseAlgorithm):
             state: What the last call returned, or None.
             episode_start: Whether each robot has just been reset, (B,). The transition across it is dropped.
             deterministic: Whether the planner draws the same candidates at each call, so that equal observations and
-                states give equal actions.
+                states give equal actions. Without a state, an agent that has lived on a robot goes on from the plan of
+                its last call.
 
         Returns:
             The actions, (action_dim,) or (B, action_dim), and the new state.
@@ -350,7 +365,12 @@ class ModelBasedAgent(BaseAlgorithm):
         obs, loop = self._tensor(np.atleast_2d(numbers)), self._loop()
         starts = torch.zeros(len(obs), dtype=torch.bool, device=self.device)
         if episode_start is not None:
-            starts |= torch.as_tensor(episode_start, device=self.device)
+            starts = torch.tensor(np.atleast_1d(episode_start), dtype=torch.bool, device=self.device)
+        if len(starts) != len(obs) or (state is not None and state.robots != len(obs)):
+            raise ValueError(
+                f"Got {len(obs)} observations, but {len(starts)} episode starts and a state of "
+                f"{len(obs) if state is None else state.robots} robots; they must be of the same robots."
+            )
         generator = self._generator
         if deterministic:
             generator = torch.Generator(self.device).manual_seed(self.seed or 0)
@@ -497,10 +517,7 @@ class ModelBasedAgent(BaseAlgorithm):
 
     def _known_reward_fn(self) -> RewardFn | None:
         """The user's reward function, or the environment's."""
-        if self._reward_fn is not None or self.env is None:
-            return self._reward_fn
-        reward_fn: RewardFn | None = env_attribute(self.env, "reward_fn", None)
-        return reward_fn
+        return self._reward_fn or self._env_reward_fn
 
     def _unit_reward_fn(self) -> RewardFn:
         """The reward of actions in [-1, 1]."""

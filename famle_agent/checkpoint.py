@@ -6,6 +6,7 @@ import io
 import json
 import os
 import zipfile
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
@@ -18,6 +19,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
+from famle_agent.hyperparameters import Hyperparameters
 from famle_agent.online import OnlineState
 
 if TYPE_CHECKING:
@@ -27,6 +29,10 @@ __all__ = ["File", "load_agent", "read_checkpoint", "save_agent", "write_checkpo
 
 _FORMAT = "famle-agent"
 _VERSION = 1
+_DAMAGE = (
+    *(zipfile.BadZipFile, zlib.error, EOFError, KeyError, SafetensorError),
+    *(ValueError, RuntimeError, NotImplementedError),  # what zipfile and json make of flipped bits
+)
 _META, _TENSORS = "agent.json", "tensors.safetensors"
 
 Agent = TypeVar("Agent", bound="ModelBasedAgent")
@@ -71,7 +77,7 @@ def read_checkpoint(file: File) -> tuple[dict[str, Any], dict[str, Tensor]]:
         with zipfile.ZipFile(source) as archive:
             meta = json.loads(archive.read(_META))
             tensors = load_tensors(archive.read(_TENSORS))
-    except (zipfile.BadZipFile, KeyError, EOFError, UnicodeDecodeError, json.JSONDecodeError, SafetensorError) as error:
+    except _DAMAGE as error:
         raise ValueError(
             f"{path} is no FAMLE checkpoint, or it is damaged ({error}). "
             "Give a file written by agent.save(); Stable-Baselines3's own zip files are another format."
@@ -117,18 +123,44 @@ def load_agent(
 ) -> Agent:
     """Makes an agent from a file: see :meth:`ModelBasedAgent.load`."""
     meta, tensors = read_checkpoint(file)
-    if meta["class"] != cls.__name__:
-        raise ValueError(f"The file holds an agent of class {meta['class']}; load it with {meta['class']}.load().")
-    if meta["needs_reward_fn"] and reward_fn is None:
+    if meta.get("class") != cls.__name__:
+        raise ValueError(
+            f"The file holds an agent of class {meta.get('class')}; load it with that class, not {cls.__name__}."
+        )
+    try:
+        spaces_ = [_box_from_json(meta[name]) for name in ("observation_space", "action_space")]
+        situations = tuple(str(name) for name in list(meta["situations"]))
+        settings = Hyperparameters.from_dict(meta["hyperparameters"]).to_dict()
+        mode, seed, angle_dims, live = meta["mode"], meta["seed"], tuple(meta["angle_dims"]), meta["live"]
+        needs_reward_fn, named_env = meta["needs_reward_fn"], meta["env"]
+        env = _named_env(named_env) if env is None else env
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"The file's description of the agent is damaged or of another version ({error!r}). Save the agent again; "
+            "if it is the environment that cannot be made, give load(..., env=...)."
+        ) from error
+    if needs_reward_fn and reward_fn is None:
         raise ValueError("The agent was made with a reward_fn, which no file can hold: give load(..., reward_fn=...).")
-    if env is None and meta["env"] is not None and meta["env"]["id"] in gym.registry:
-        env = gym.make(meta["env"]["id"], **meta["env"]["kwargs"])
-    settings = {**meta["hyperparameters"], **overrides}
-    agent = cls(env, meta["mode"], reward_fn=reward_fn, angle_dims=meta["angle_dims"], device=device, **settings)
-    agent.situations, agent.seed = tuple(meta["situations"]), meta["seed"]
-    _restore_spaces(agent, _box_from_json(meta["observation_space"]), _box_from_json(meta["action_space"]))
-    _restore_tensors(agent, tensors, meta["live"])
+    agent = cls(env, mode, reward_fn=reward_fn, angle_dims=angle_dims, device=device, **{**settings, **overrides})
+    agent.situations, agent.seed = situations, seed
+    _restore_spaces(agent, *spaces_)
+    try:
+        _restore_tensors(agent, tensors, live)
+    except (KeyError, RuntimeError, TypeError) as error:
+        raise ValueError(
+            f"The file's weights do not fit its settings; it is damaged, or an override changed the network: {error}"
+        ) from error
     return agent
+
+
+def _named_env(named: dict[str, Any] | None) -> gym.Env[Any, Any] | None:
+    """The environment that a file names, if it is one of ours: another one's arguments might run anything."""
+    if named is None or named["id"] not in gym.registry:
+        return None
+    entry_point = gym.registry[named["id"]].entry_point
+    if not isinstance(entry_point, str) or not entry_point.startswith("famle_envs."):
+        return None
+    return gym.make(named["id"], **named["kwargs"])
 
 
 def _restore_spaces(agent: ModelBasedAgent, observation_space: spaces.Box, action_space: spaces.Box) -> None:
@@ -146,20 +178,16 @@ def _restore_tensors(agent: ModelBasedAgent, tensors: dict[str, Tensor], live: d
         prefix = f"{name}/"
         return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
-    try:
-        if weights := part("dynamics"):
-            agent.dynamics = agent._new_dynamics(len(agent.situations))
-            agent.dynamics.load_state_dict(weights)
-        if weights := part("reward"):
-            agent._learned_reward = agent._new_reward()
-            agent._learned_reward.load_state_dict(weights)
-    except RuntimeError as error:
-        raise ValueError(
-            f"The file's weights do not fit its settings; it is damaged, or an override changed the network: {error}"
-        ) from error
+    if weights := part("dynamics"):
+        agent.dynamics = agent._new_dynamics(len(agent.situations))
+        agent.dynamics.load_state_dict(weights)
+    if weights := part("reward"):
+        agent._learned_reward = agent._new_reward()
+        agent._learned_reward.load_state_dict(weights)
     if live is not None:
         state = {name: value.to(agent.device) for name, value in part("live").items()}
-        agent._live = OnlineState.from_tensors(state, **live)
+        settings = agent.hyperparameters
+        agent._live = OnlineState.from_tensors(state, **live).resized(settings.memory_size, settings.horizon)
     if agent.device.type == "cpu" and "generator/state" in tensors:
         agent._generator.set_state(tensors["generator/state"])
 

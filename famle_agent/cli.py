@@ -82,12 +82,16 @@ class Run:
         """Runs the episodes and prints their returns."""
         agent = FAMLE.load(self.agent)
         agent.set_random_seed(self.seed)
-        spec = agent.get_env().get_attr("spec")[0]  # type: ignore[union-attr]
+        robot = agent.get_env()
+        if robot is None:
+            raise ValueError(f"{self.agent} names no environment that can be made here; use FAMLE.load(path, env).")
+        spec = robot.get_attr("spec")[0]
         env = FAMLEWrapper(gym.make(spec.id, **{**spec.kwargs, "situation": self.situation}), agent)
         for i in range(self.episodes):
             episode = run_episode(env, self.seed if i == 0 else None)
             Console().print(
-                f"episode {i}: return {episode.total:.1f}, believes {episode.situation} ({episode.probability:.0%})"
+                f"episode {i}: return {episode.total:.1f}, believes {episode.situation} ({episode.probability:.0%})",
+                markup=False,
             )
         env.close()
 
@@ -103,6 +107,6 @@ def main(args: list[str] | None = None) -> None:
     )
     try:
         command()
-    except (ValueError, TypeError, FileNotFoundError, NotLearnedError) as error:
-        Console(stderr=True).print(f"[red]famle:[/red] {error}")
+    except (ValueError, TypeError, OSError, NotLearnedError) as error:
+        Console(stderr=True).print(f"famle: {error}", markup=False, highlight=False)
         sys.exit(2)

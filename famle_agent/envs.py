@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from itertools import chain, count
 from typing import Any
 
 import gymnasium as gym
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import VecEnv
 
 from famle_agent.hyperparameters import known_robots
@@ -30,10 +32,10 @@ def make_env(env: str | gym.Env[Any, Any] | VecEnv) -> gym.Env[Any, Any] | VecEn
     robots = {name: robot.env_id for name, robot in known_robots().items() if robot.env_id}
     try:
         return gym.make(robots.get(env, env))
-    except gym.error.Error as error:
+    except (gym.error.Error, ImportError) as error:
         raise ValueError(
-            f"No environment is called {env!r}. Give a robot ({', '.join(robots)}), a registered Gymnasium id "
-            "or an environment."
+            f"Cannot make the environment {env!r} ({error}). Give a robot ({', '.join(robots)}), a registered "
+            "Gymnasium id or an environment."
         ) from error
 
 
@@ -54,8 +56,8 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
 
 
 def env_spec(env: VecEnv) -> dict[str, Any] | None:
-    """The Gymnasium id and arguments of an environment as JSON types, if it is a registered one."""
-    spec = env.get_attr("spec")[0]
+    """The Gymnasium id and arguments of an environment as JSON types, if that is all there is to say of it."""
+    spec = _plain_spec(env)
     if spec is None:
         return None
     kwargs = {key: value.to_dict() if isinstance(value, Situation) else value for key, value in spec.kwargs.items()}
@@ -64,6 +66,14 @@ def env_spec(env: VecEnv) -> dict[str, Any] | None:
     except TypeError:  # an argument that no file can name
         return None
     return {"id": spec.id, "kwargs": kwargs}
+
+
+def _plain_spec(env: VecEnv) -> EnvSpec | None:
+    """The spec of a registered environment that nothing but a ``Monitor`` wraps."""
+    spec: EnvSpec | None = env.get_attr("spec")[0]
+    if spec is None or any(wrapper.name != "Monitor" for wrapper in spec.additional_wrappers):
+        return None
+    return spec
 
 
 def situation_envs(
@@ -96,7 +106,8 @@ def situation_envs(
         made.append(_one_env(env, item))
         situation = _get(made[-1], "situation", None)
         label = situation.label if isinstance(situation, Situation) else f"situation {i}"
-        labels.append(label if label not in labels else f"{label} ({i})")
+        names = chain([label], (f"{label} ({j})" for j in count(i)))
+        labels.append(next(name for name in names if name not in labels))
         ours.append(not is_env)
     return made, labels, ours
 
@@ -105,9 +116,11 @@ def _one_env(env: VecEnv, item: EnvLike) -> gym.Env[Any, Any]:
     if isinstance(item, gym.Env):
         return item
     if isinstance(item, (Situation, Mapping, str)):
-        spec = env.get_attr("spec")[0]
+        spec = _plain_spec(env)
         if spec is None:
-            raise ValueError("Situations need a registered environment; give environments or factories instead.")
+            raise ValueError(
+                "Situations need a registered environment without wrappers; give environments or factories instead."
+            )
         try:
             return gym.make(spec.id, **{**spec.kwargs, "render_mode": None, "situation": item})
         except TypeError as error:

@@ -113,6 +113,8 @@ class Hyperparameters:
                 hint = f" Did you mean {close[0]!r}?" if close else ""
                 raise TypeError(f"There is no setting {key!r}.{hint} Settings: {', '.join(known)}.")
             default = known[key].default
+            if isinstance(default, int) and isinstance(value, float):
+                raise TypeError(f"{key} must be a whole number, got {value!r}.")
             if isinstance(default, (int, float)) and (
                 isinstance(value, str) or isinstance(value, bool) != isinstance(default, bool)
             ):

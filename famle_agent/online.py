@@ -38,6 +38,11 @@ class OnlineState:
         """B."""
         return len(self.plan)
 
+    def resized(self, memory_size: int, horizon: int) -> OnlineState:
+        """The same for another M and H."""
+        plan = torch.cat([self.plan, torch.zeros_like(self.plan[:, :1]).repeat(1, horizon, 1)], dim=1)[:, :horizon]
+        return replace(self, memory=self.memory.resized(memory_size), plan=plan)
+
     def to_tensors(self) -> dict[str, Tensor]:
         """All but :attr:`last` and the counts, for a checkpoint."""
         tensors = {f"theta.{name}": value for name, value in self.belief.theta.items()}
@@ -119,4 +124,4 @@ class OnlineLoop:
         if self.forget_at_reset:
             memory = replace(state.memory, weight=state.memory.weight * kept[:, None])
             state = replace(state, memory=memory, belief=state.belief.where(kept, self.prior(state.robots)))
-        return replace(state, plan=state.plan * kept[:, None, None])
+        return replace(state, plan=torch.where(kept[:, None, None], state.plan, 0.0))

@@ -41,8 +41,8 @@ def imagine(model: Model, reward_fn: RewardFn, obs: Tensor, actions: Tensor) -> 
         The return of each candidate, (B, N); -inf where the model left the finite numbers.
     """
     # A few thousand candidates at a time stay in the processor's cache over the whole horizon.
-    returns = [_imagine(model, reward_fn, obs, part) for part in actions.split(_CANDIDATES_AT_ONCE, dim=1)]
-    return torch.nan_to_num(torch.cat(returns, dim=1), nan=-math.inf, posinf=-math.inf)
+    returns = [_imagine(model, reward_fn, obs, part) for part in torch.split(actions, _CANDIDATES_AT_ONCE, dim=1)]
+    return torch.nan_to_num(torch.cat(returns, dim=1), nan=-math.inf, posinf=-math.inf, neginf=-math.inf)
 
 
 def _imagine(model: Model, reward_fn: RewardFn, obs: Tensor, actions: Tensor) -> Tensor:
@@ -155,10 +155,12 @@ class MPPI(Planner):
             noise = self.init_std * _coloured_noise(start, self.candidates, self.noise_beta, generator)
             tau = torch.cat([mean[:, None], (mean[:, None] + noise).clamp(-1.0, 1.0)], dim=1)
             returns = judge(tau)
-            finite = torch.where(returns.isfinite(), returns, returns.amax(dim=1, keepdim=True))
+            best = returns.amax(dim=1, keepdim=True)
+            finite = torch.where(returns.isfinite(), returns, best).nan_to_num(neginf=0.0)
             scale = (self.temperature * finite.std(dim=1, keepdim=True)).clamp(min=1e-8)
-            weight = torch.softmax(returns / scale, dim=1)
-            mean = torch.einsum("bn,bnha->bha", weight, tau)
+            # Where no candidate stayed among the finite numbers, none is better than another.
+            advantage = torch.where(best.isfinite(), returns - best, 0.0)
+            mean = torch.einsum("bn,bnha->bha", torch.softmax(advantage / scale, dim=1), tau)
         return mean[:, 0], mean
 
 

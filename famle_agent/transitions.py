@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import zipfile
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,6 +69,8 @@ class Transitions:
 
     def __post_init__(self) -> None:
         shape = (len(self.situations), self.obs.shape[1] if self.obs.ndim == 3 else -1)
+        if 0 in shape:
+            raise ValueError("There are no transitions; collect at least one in at least one situation.")
         for name in ("obs", "action", "reward", "next_obs"):
             value = getattr(self, name)
             if value.shape[:2] != shape or value.ndim != (2 if name == "reward" else 3):
@@ -81,16 +84,13 @@ class Transitions:
         """Writes a compressed NumPy archive; an older file stays whole until the new one is complete."""
         target = Path(path)
         partial = target.with_name(target.name + ".partial")
-        with partial.open("wb") as file:
-            np.savez_compressed(
-                file,
-                obs=self.obs,
-                action=self.action,
-                reward=self.reward,
-                next_obs=self.next_obs,
-                situations=np.array(self.situations),
-            )
-        partial.replace(target)
+        arrays = {name: getattr(self, name) for name in ("obs", "action", "reward", "next_obs")}
+        try:
+            with partial.open("wb") as file:
+                np.savez_compressed(file, **arrays, situations=np.array(self.situations))
+            partial.replace(target)
+        finally:
+            partial.unlink(missing_ok=True)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Transitions:
@@ -104,7 +104,15 @@ class Transitions:
             with np.load(path, allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in ("obs", "action", "reward", "next_obs")}
                 situations = tuple(str(name) for name in archive["situations"])
-        except (zipfile.BadZipFile, KeyError, ValueError, EOFError, AttributeError) as error:
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            EOFError,
+            KeyError,
+            NotImplementedError,
+            TypeError,
+            ValueError,
+        ) as error:
             raise ValueError(f"{path} holds no transitions, or not all of them; collect them again.") from error
         return cls(**arrays, situations=situations)
 
@@ -143,14 +151,15 @@ def _collect_one(
     env: gym.Env[Any, Any], n: int, policy: Policy, sequence: np.random.SeedSequence
 ) -> tuple[Array, Array, Array, Array]:
     rows: list[tuple[Any, Any, Any, Any]] = []
-    obs, _ = env.reset(seed=int(sequence.generate_state(1)[0]))
+    obs = np.array(env.reset(seed=int(sequence.generate_state(1)[0]))[0])
     episode_start = True
     while len(rows) < n:
         action = policy(obs, episode_start)
         next_obs, reward, terminated, truncated, _ = env.step(action)
+        next_obs = np.array(next_obs)  # a copy: an environment may fill the same array again
         rows.append((obs, action, reward, next_obs))
         obs, episode_start = next_obs, terminated or truncated
         if episode_start:
-            obs, _ = env.reset()
+            obs = np.array(env.reset()[0])
     obs_, action_, reward_, next_obs_ = (np.array(column, dtype=np.float32) for column in zip(*rows, strict=True))
     return obs_, action_, reward_, next_obs_

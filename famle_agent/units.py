@@ -58,7 +58,7 @@ def check_action(action: Any, space: spaces.Box) -> Array:
 
 def _check(name: str, values: Any, space: spaces.Box) -> Array:
     try:
-        array = np.asarray(values, dtype=np.float32)
+        array = np.array(values, dtype=np.float32)  # a copy: an environment may fill the same array again
     except (TypeError, ValueError) as error:
         raise ValueError(f"The {name} must be an array of numbers, got {type(values).__name__}.") from error
     if array.ndim not in (1, 2) or array.shape[-1:] != space.shape:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import RecordConstructorArgs
 
@@ -48,7 +49,7 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
         obs, info = self.env.reset(seed=seed, options=options)
         self.agent.serve(self)
         self.agent.begin_episode()
-        self._obs = obs
+        self._obs = np.array(obs)  # a copy: an environment may fill the same array again
         return obs, info | {"famle": self._belief()}
 
     def step(self, action: Array) -> tuple[Array, Any, bool, bool, dict[str, Any]]:
@@ -63,7 +64,7 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
         self.agent.serve(self, takes_over=False)
         obs, reward, terminated, truncated, info = self.env.step(action)
         self.agent.observe(self._obs, action, obs)
-        self._obs = obs
+        self._obs = np.array(obs)
         return obs, reward, terminated, truncated, info | {"famle": self._belief()}
 
     def _belief(self) -> dict[str, Any]:

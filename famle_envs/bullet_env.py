@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from contextlib import suppress
 from importlib.resources import as_file, files
 from typing import Any, ClassVar
 
@@ -181,7 +182,8 @@ class BulletEnv(gym.Env[Array, Array]):
     def close(self) -> None:
         """Ends the physics world; a second call does nothing."""
         if self._client is not None:
-            pybullet.disconnect(physicsClientId=self._client)
+            with suppress(pybullet.error):  # at the interpreter's end the world may be gone already
+                pybullet.disconnect(physicsClientId=self._client)
             self._client = None
 
     def __del__(self) -> None:

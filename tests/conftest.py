@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import matplotlib as mpl
+import pytest
+import torch
+from hypothesis import settings
+
+import famle_envs  # noqa: F401 (registers the robots)
+from famle_agent import FAMLE, Transitions
+from famle_agent.hyperparameters import known_robots
+
+mpl.use("Agg")
+torch.set_num_threads(1)
+settings.register_profile("famle", deadline=None, max_examples=25, derandomize=True)
+settings.load_profile("famle")
+
+SMALL: dict[str, Any] = {
+    "transitions_per_situation": 400,
+    "action_hold": 5,
+    "hidden": (70, 50),
+    "meta_iterations": 100,
+    "meta_batch_size": 11,
+    "inner_steps": 20,
+    "adapt_every": 2,
+    "memory_size": 50,
+    "horizon": 10,
+    "candidates": 100,
+    "planner_iterations": 3,
+    "elites": 10,
+}
+"""Settings of an agent that knows its situations after a few seconds of learning."""
+
+QUICK: dict[str, Any] = {"adapt_every": 5, "adapt_steps": 2, "candidates": 20, "planner_iterations": 1}
+"""Settings of a loaded agent for tests that need it to run and not to be good."""
+
+
+@pytest.fixture(scope="session")
+def transitions() -> Transitions:
+    """Random transitions of the reacher's 11 training situations."""
+    agent = FAMLE("reacher", seed=0, device="cpu", **SMALL)
+    collected = agent.collect()
+    agent.get_env().close()
+    return collected
+
+
+@pytest.fixture(scope="session")
+def agent_file(transitions: Transitions, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small meta-learned agent for the reacher."""
+    agent = FAMLE("reacher", seed=0, device="cpu", **SMALL)
+    path = tmp_path_factory.mktemp("agent") / "reacher.zip"
+    agent.meta_learn(transitions).save(path)
+    agent.get_env().close()
+    return path
+
+
+@pytest.fixture
+def load_agent(agent_file: Path) -> Iterator[Callable[..., FAMLE]]:
+    """Loads fresh copies of the small agent, with settings changed."""
+    agents = []
+
+    def load(**overrides: Any) -> FAMLE:
+        agents.append(FAMLE.load(agent_file, device="cpu", **overrides))
+        return agents[-1]
+
+    yield load
+    for agent in agents:
+        agent.get_env().close()
+
+
+@pytest.fixture
+def agent(load_agent: Callable[..., FAMLE]) -> FAMLE:
+    """A fresh copy of the small agent with its own settings."""
+    return load_agent()
+
+
+@pytest.fixture
+def quick_agent(load_agent: Callable[..., FAMLE]) -> FAMLE:
+    """A fresh copy of the small agent that plans and adapts in little time, and not well."""
+    return load_agent(**QUICK)
+
+
+@pytest.fixture
+def make_env() -> Iterator[Callable[..., gym.Env[Any, Any]]]:
+    """Makes environments that are closed after the test."""
+    envs = []
+
+    def make(env_id: str = "FamleReacher-v0", **kwargs: Any) -> gym.Env[Any, Any]:
+        envs.append(gym.make(env_id, **kwargs))
+        return envs[-1]
+
+    yield make
+    for env in envs:
+        env.close()
+
+
+@pytest.fixture
+def tiny_budgets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shrinks what an agent spends by default, and the reacher's episodes."""
+    tiny = {**QUICK, "transitions_per_situation": 40, "meta_iterations": 3, "inner_steps": 3}
+    for robot in known_robots().values():
+        for mode in robot.modes.values():
+            for name, value in tiny.items():
+                monkeypatch.setitem(mode, name, value)
+    monkeypatch.setattr(gym.spec("FamleReacher-v0"), "max_episode_steps", 6)

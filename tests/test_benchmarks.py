@@ -1,0 +1,144 @@
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks import reacher
+from benchmarks.harness import Replicate, load_results, run_replicates
+from benchmarks.identification import accuracy, across_the_wrap
+from benchmarks.report import curves, first_crossing, interquartile_mean, plot_curves, solved_at, summary
+from famle_agent import FAMLE, Transitions
+from famle_envs.reacher import ReacherEnv
+
+
+def squared(seed: int, log: Path) -> dict[str, Any]:
+    with log.open("a") as file:
+        file.write(f"{seed}\n")
+    if seed == 2:
+        raise ArithmeticError("a replicate fails")
+    return {"returns": [float(seed**2)] * 4, "lengths": [50] * 4, "seconds_per_step": 0.01}
+
+
+def replicates(n: int, log: Path) -> list[Replicate]:
+    return [Replicate("method", seed, partial(squared, seed, log)) for seed in range(n)]
+
+
+def test_finished_replicates_are_stored_and_not_run_again(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    run_replicates(replicates(2, log), tmp_path / "out", jobs=1)
+    run_replicates(replicates(2, log), tmp_path / "out", jobs=1)
+    assert log.read_text().split() == ["0", "1"]
+    results = load_results(tmp_path / "out")
+    assert [result["seed"] for result in results] == [0, 1]
+    assert {"command", "commit", "versions", "wall_seconds", "method"} <= results[0].keys()
+
+
+def test_failing_replicate_loses_nothing_that_was_finished(tmp_path: Path) -> None:
+    with pytest.raises(ArithmeticError):
+        run_replicates(replicates(3, tmp_path / "log"), tmp_path / "out", jobs=1)
+    assert [result["seed"] for result in load_results(tmp_path / "out")] == [0, 1]
+    assert not list((tmp_path / "out").glob("*.partial"))
+
+
+def test_missing_results_are_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="holds no results"):
+        load_results(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("returns", "solved", "crossed"),
+    [
+        ([10, 31, 31, 31], 100, 100),
+        ([31, 10, 31, 31, 31], 150, 50),
+        ([31, 31, 30], None, 50),
+        ([1, 2, 3], None, None),
+    ],
+)
+def test_solved_needs_three_episodes_in_a_row(returns: list[float], solved: int | None, crossed: int | None) -> None:
+    lengths = [50] * len(returns)
+    assert solved_at(returns, lengths, 30.0) == solved
+    assert first_crossing(returns, lengths, 30.0) == crossed
+
+
+def test_interquartile_mean_ignores_outliers_and_lies_in_its_interval() -> None:
+    mean, low, high = interquartile_mean([1.0, 10.0, 10.0, 11.0, 12.0, 1000.0, 9.0, 10.0])
+    assert low <= mean <= high
+    assert mean == 10.25
+    assert interquartile_mean([3.0]) == (3.0, 3.0, 3.0)
+
+
+def test_summary_and_picture_cover_all_methods(tmp_path: Path) -> None:
+    results = [
+        {"method": method, "seed": seed, "returns": [5.0 + seed, 31.0, 32.0, 33.0], "lengths": [50] * 4}
+        | {"seconds_per_step": 0.02}
+        for method in ("a", "b")
+        for seed in range(3)
+    ]
+    table = summary(results, threshold=30.0, title="title", within=100)
+    cells = [list(column.cells) for column in table.columns]
+    assert cells[0] == ["a", "b"]
+    assert cells[2] == ["6.0 (5.5-6.5)"] * 2
+    assert cells[6] == ["100"] * 2
+    assert cells[8] == ["3/3"] * 2
+    assert list(curves(results)) == ["a", "b"]
+    plot_curves(results, 30.0, "title", tmp_path / "curves.png", steps=200)
+    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_test_damages_are_unseen_and_differ_between_replicates() -> None:
+    drawn = [reacher.situation_of("random", seed) for seed in range(20)]
+    assert not set(drawn) & set(ReacherEnv.training_situations)
+    assert len(set(drawn)) == 20
+    assert reacher.situation_of("paper", 0) == reacher.situation_of("paper", 1)
+
+
+@pytest.mark.slow
+def test_reacher_benchmark_runs_every_fast_method_and_reports(
+    tmp_path: Path, agent: FAMLE, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cache = tmp_path / "cache"
+    agent.save(cache / "reacher-ours-0.zip")
+    methods = ("famle", "famle-frozen", "famle-select", "ppo")
+    args = reacher.Args(
+        methods=methods, replicates=1, steps=150, ppo_steps=200, jobs=1, out=tmp_path / "results", cache=cache
+    )
+    reacher.main(args)
+    table = capsys.readouterr().out
+    assert all(method in table for method in methods)
+    stored = {path.name: json.loads(path.read_text()) for path in (tmp_path / "results").glob("*/*.json")}
+    assert stored.keys() == {f"{method}-0.json" for method in methods}
+    assert len(stored["famle-0.json"]["returns"]) == 3
+    assert stored["famle-0.json"]["returns"] != stored["famle-frozen-0.json"]["returns"]
+    assert (tmp_path / "results" / "reacher-paper.png").exists()
+
+
+def test_unknown_method_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="famle-frozen"):
+        reacher.main(reacher.Args(methods=("magic",), out=tmp_path))
+
+
+def test_turned_transition_crosses_the_wrap_and_stays_true(transitions: Transitions) -> None:
+    turned = across_the_wrap(transitions, 3)
+    before, after = turned.obs[:, 3, 0], turned.next_obs[:, 3, 0]
+    moved = np.abs(transitions.next_obs[:, 3, 0] - transitions.obs[:, 3, 0]) > 1e-3
+    assert moved.any()
+    np.testing.assert_array_less(5.0, np.abs(after - before)[moved])
+    # The tip keeps its distance from the base, and the link angles are its polar angle's.
+    for values, original in ((turned.obs, transitions.obs), (turned.next_obs, transitions.next_obs)):
+        np.testing.assert_allclose(
+            np.linalg.norm(values[:, 3, 10:], axis=-1), np.linalg.norm(original[:, 3, 10:], axis=-1), atol=1e-5
+        )
+        links = np.cumsum(values[:, 3, :5], axis=-1)
+        tip = 0.3 * np.stack([np.cos(links).sum(-1), np.sin(links).sum(-1)], axis=-1)
+        np.testing.assert_allclose(values[:, 3, 10:], tip, atol=1e-4)
+
+
+def test_identification_counts_right_answers(agent: FAMLE, transitions: Transitions) -> None:
+    assert agent.dynamics is not None
+    right = accuracy(agent.dynamics, transitions, size=50, windows=2, wrap=False)
+    swapped = replace(transitions, obs=transitions.obs[::-1].copy(), next_obs=transitions.next_obs[::-1].copy())
+    assert accuracy(agent.dynamics, swapped, size=50, windows=2, wrap=False) < 0.5 < right <= 1.0

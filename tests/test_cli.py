@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from famle_agent import FAMLE
+from famle_agent.cli import main
+from famle_agent.demo import run_demo
+from famle_envs.reacher import ReacherEnv
+
+pytestmark = pytest.mark.usefixtures("tiny_budgets")
+
+
+def scalars(folder: Path) -> list[str]:
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    return events.Tags()["scalars"]
+
+
+@pytest.mark.slow
+def test_demo_writes_all_it_promises(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "results" / "demo"
+    main(["demo", "--out", str(out), "--episodes", "2", "--meta-iterations", "2", "--situation", "joint 3 dead"])
+    assert Image.open(out / "returns.png").size[0] > 100
+    film = Image.open(out / "robot.gif")
+    assert film.n_frames > 1
+    assert film.size[0] > 2.5 * film.size[1]  # three films next to each other
+    agent = FAMLE.load(out / "agent.zip", device="cpu")
+    assert agent.hyperparameters.meta_iterations == 2
+    assert len(agent.situations) == 11
+    agent.get_env().close()
+    assert "meta/loss_after" in scalars(out / "tensorboard" / "FAMLE_meta_1")
+    for name in ("with_adaptation", "without_adaptation"):
+        assert {"step/reward", "episode/return", "posterior/joint 3 dead"} <= set(scalars(out / "tensorboard" / name))
+    shown = capsys.readouterr().out
+    assert "broken" in shown
+    assert "returns.png" in shown
+
+
+@pytest.mark.slow
+def test_demo_gives_its_episodes(tmp_path: Path) -> None:
+    results = run_demo(situation="joint 0 reversed", episodes=1, out=tmp_path, seed=1, candidates=5)
+    assert list(results) == ["with adaptation", "without adaptation"]
+    for episodes in results.values():
+        assert len(episodes) == 2
+        assert all(0 < episode.total < 6 and episode.seconds > 0 for episode in episodes)
+        assert all(len(episode.frames) == 6 for episode in episodes)
+        assert all(0 <= episode.probability <= 1 for episode in episodes)
+    assert results["without adaptation"][1].probability == pytest.approx(1 / 11)
+
+
+def test_meta_learned_agent_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "arm.zip"
+    main(["meta-learn", "--robot", "reacher", "--out", str(path), "--tensorboard", str(tmp_path / "tb"), "--seed", "3"])
+    assert path.exists()
+    assert (tmp_path / "tb" / "FAMLE_meta_1").is_dir()
+    shown = []
+    for _ in range(2):
+        capsys.readouterr()
+        main(["run", str(path), "--situation", "joint 2 dead", "--episodes", "2"])
+        shown.append(capsys.readouterr().out)
+    assert "episode 0: return" in shown[0]
+    assert "episode 1: return" in shown[0]
+    assert "believes joint" in shown[0] or "believes intact" in shown[0]
+    assert shown[0] == shown[1]  # the same seed
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["demo", "--situation", "joint 9 dead"], "joint"),
+        (["demo", "--situation", "tired"], "No situation is called 'tired'"),
+        (["demo", "--robot", "walker"], "reacher"),
+        (["demo", "--robot", "default"], "default"),
+        (["meta-learn", "--robot", "walker"], "reacher"),
+        (["meta-learn", "--robot", "Pendulum-v1"], "no training situations"),
+        (["meta-learn", "--mode", "best"], "mode must be one of"),
+        (["meta-learn", "--robot", "no_such_module:Walker-v0"], "no_such_module"),
+        (["demo", "--situation", "[/joint 3 dead]"], "[/joint 3 dead]"),
+        (["run", "nothing.zip"], "nothing.zip"),
+        (["run", "."], "directory"),
+    ],
+)
+def test_mistakes_end_with_advice(
+    args: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as caught:
+        main(args)
+    assert caught.value.code == 2
+    error = capsys.readouterr().err
+    assert message in " ".join(error.split())
+    assert "Traceback" not in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_situation_that_the_robot_cannot_have(agent_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["run", str(agent_file), "--situation", "friction x 0.5"])
+    assert caught.value.code == 2
+    assert "friction" in capsys.readouterr().err
+
+
+def test_agent_whose_environment_is_not_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    unregistered = ReacherEnv()
+    FAMLE(unregistered, device="cpu").save(tmp_path / "arm.zip")
+    unregistered.close()
+    with pytest.raises(SystemExit) as caught:
+        main(["run", str(tmp_path / "arm.zip")])
+    assert caught.value.code == 2
+    assert "environment" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("args", [[], ["fly"], ["run"], ["demo", "--episodes", "many"]])
+def test_wrong_command_line(args: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(args)
+    assert caught.value.code == 2
+    assert capsys.readouterr().err
+
+
+def test_help_names_the_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["--help"])
+    assert caught.value.code == 0
+    shown = capsys.readouterr().out
+    for command in ("demo", "meta-learn", "run"):
+        assert command in shown
