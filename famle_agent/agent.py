@@ -368,7 +368,7 @@ class ModelBasedAgent(BaseAlgorithm):
             starts = torch.tensor(np.atleast_1d(episode_start), dtype=torch.bool, device=self.device)
         if len(starts) != len(obs) or (state is not None and state.robots != len(obs)):
             raise ValueError(
-                f"Got {len(obs)} observations, but {len(starts)} episode starts and a state of "
+                f"Got {len(obs)} observations, but {len(starts)} values of episode_start and a state of "
                 f"{len(obs) if state is None else state.robots} robots; they must be of the same robots."
             )
         generator = self._generator

@@ -19,6 +19,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
+from famle_agent.envs import make_env
 from famle_agent.hyperparameters import Hyperparameters
 from famle_agent.online import OnlineState
 
@@ -123,12 +124,12 @@ def load_agent(
 ) -> Agent:
     """Makes an agent from a file: see :meth:`ModelBasedAgent.load`."""
     meta, tensors = read_checkpoint(file)
-    if meta.get("class") != cls.__name__:
+    if (kind := meta.get("class")) != cls.__name__:
         raise ValueError(
-            f"The file holds an agent of class {meta.get('class')}; load it with that class, not {cls.__name__}."
+            f"The file is no FAMLE checkpoint of a {cls.__name__} but of a {kind}; load it with {kind}.load()."
         )
     try:
-        spaces_ = [_box_from_json(meta[name]) for name in ("observation_space", "action_space")]
+        observation_space, action_space = (_box_from_json(meta[f"{name}_space"]) for name in ("observation", "action"))
         situations = tuple(str(name) for name in list(meta["situations"]))
         settings = Hyperparameters.from_dict(meta["hyperparameters"]).to_dict()
         mode, seed, angle_dims, live = meta["mode"], meta["seed"], tuple(meta["angle_dims"]), meta["live"]
@@ -141,9 +142,13 @@ def load_agent(
         ) from error
     if needs_reward_fn and reward_fn is None:
         raise ValueError("The agent was made with a reward_fn, which no file can hold: give load(..., reward_fn=...).")
+    if env is not None:
+        env = make_env(env)
+        _check_env(env, observation_space, action_space)
     agent = cls(env, mode, reward_fn=reward_fn, angle_dims=angle_dims, device=device, **{**settings, **overrides})
     agent.situations, agent.seed = situations, seed
-    _restore_spaces(agent, *spaces_)
+    if env is None:
+        agent.observation_space, agent.action_space, agent.n_envs = observation_space, action_space, 1
     try:
         _restore_tensors(agent, tensors, live)
     except (KeyError, RuntimeError, TypeError) as error:
@@ -163,12 +168,10 @@ def _named_env(named: dict[str, Any] | None) -> gym.Env[Any, Any] | None:
     return gym.make(named["id"], **named["kwargs"])
 
 
-def _restore_spaces(agent: ModelBasedAgent, observation_space: spaces.Box, action_space: spaces.Box) -> None:
-    if agent.env is None:
-        agent.observation_space, agent.action_space, agent.n_envs = observation_space, action_space, 1
-    elif agent.observation_space != observation_space or agent.action_space != action_space:
+def _check_env(env: Any, observation_space: spaces.Box, action_space: spaces.Box) -> None:
+    if env.observation_space != observation_space or env.action_space != action_space:
         raise ValueError(
-            f"The environment's spaces, {agent.observation_space} and {agent.action_space}, are not the agent's, "
+            f"The environment's spaces, {env.observation_space} and {env.action_space}, are not the agent's, "
             f"{observation_space} and {action_space}."
         )
 
