@@ -71,7 +71,8 @@ class MAML:
         optimizer = torch.optim.Adam(model.theta.parameters(), lr=self.meta_lr, foreach=True)
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda done: 1.0 - done / self.iterations)
         for iteration in range(self.iterations):
-            c = torch.randperm(n_situations, generator=generator)[:meta_batch_size].to(data.x.device)
+            drawn = torch.randperm(n_situations, generator=generator, device=generator.device)
+            c = drawn[:meta_batch_size].to(data.x.device)
             support, query = self._sample(data, c, generator)
 
             theta = expand(dict(model.theta.items()), meta_batch_size)
@@ -106,7 +107,8 @@ class MAML:
 
     def _sample(self, data: Batch, c: Tensor, generator: torch.Generator) -> tuple[Batch, Batch]:
         """Transitions of each situation in ``c`` for the inner steps, and others to judge them by."""
-        order = torch.rand(len(c), data.x.shape[1], generator=generator).argsort(dim=1).to(data.x.device)
+        chance = torch.rand(len(c), data.x.shape[1], generator=generator, device=generator.device)
+        order = chance.argsort(dim=1).to(data.x.device)
         support, query, _ = order.tensor_split([self.batch_size, self.batch_size + self.query_size], dim=1)
         c = c[:, None]
         return (

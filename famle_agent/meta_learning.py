@@ -78,7 +78,8 @@ class Reptile:
             )
         meta_batch_size = min(self.meta_batch_size, n_situations)
         for iteration in range(self.iterations):
-            c = torch.randperm(n_situations, generator=generator)[:meta_batch_size].to(data.x.device)
+            order = torch.randperm(n_situations, generator=generator, device=generator.device)
+            c = order[:meta_batch_size].to(data.x.device)
             theta, h = model.parameters_by_name(), model.embeddings[c]
 
             sample = partial(self._sample, data, c, generator)
@@ -96,5 +97,5 @@ class Reptile:
     def _sample(self, data: Batch, c: Tensor, generator: torch.Generator) -> Batch:
         """A minibatch of each situation in ``c``."""
         shape = (len(c), self.batch_size)
-        i = torch.randint(data.x.shape[1], shape, generator=generator).to(data.x.device)
+        i = torch.randint(data.x.shape[1], shape, generator=generator, device=generator.device).to(data.x.device)
         return Batch(data.x[c[:, None], i], data.y[c[:, None], i], data.weight[c[:, None], i])
