@@ -48,7 +48,7 @@ def famle(task: Task, seed: int, mode: str = "ours", **overrides: Any) -> Result
 
 
 def oracle(task: Task, seed: int) -> Result:
-    """The upper line: a model trained on the very test situation, on as many transitions; it has nothing to adapt to."""
+    """The upper line: a model of the very test situation, of as many transitions; it has nothing to adapt to."""
     probe = FAMLE(task.robot, device="cpu")
     situations = len(gym.make(task.env_id).get_wrapper_attr("training_situations"))
     n = situations * probe.hyperparameters.transitions_per_situation

@@ -115,8 +115,12 @@ def adapt(model: Dynamics, memory: Memory, inner_loop: InnerLoop, belief: Belief
         belief: The belief until now; of it only the number of adaptations lives on.
     """
     data = model.encode(memory.obs, memory.action, memory.next_obs, memory.weight)
+
+    # h_likely = argmax log p(D_M | theta_meta, h) over H_meta (line 6).
     log_likelihood = situation_log_likelihood(model, data)
     h_likely = model.embeddings[log_likelihood.argmax(dim=1)]
+
+    # theta*, h* = k steps from theta_meta, h_likely (line 7).
     start = Belief(expand(model.parameters_by_name(), len(h_likely)), h_likely, log_likelihood, belief.adaptations + 1)
     theta, h, _ = inner_loop(model, start.theta, start.h, lambda: data)
     adapted = replace(start, theta=theta, h=h)

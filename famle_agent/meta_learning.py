@@ -78,13 +78,16 @@ class Reptile:
             )
         meta_batch_size = min(self.meta_batch_size, n_situations)
         for iteration in range(self.iterations):
+            # Sample situations c and start from theta and h_c (line 10).
             order = torch.randperm(n_situations, generator=generator, device=generator.device)
             c = order[:meta_batch_size].to(data.x.device)
             theta, h = model.parameters_by_name(), model.embeddings[c]
 
+            # theta~, h~ = U^k(theta, h_c) (line 11).
             sample = partial(self._sample, data, c, generator)
             theta_tilde, h_tilde, losses = inner_loop(model, expand(theta, meta_batch_size), h, sample)
 
+            # Move theta towards the mean of theta~ and each h_c towards its h~ (lines 12 and 13).
             decay = 1.0 - iteration / self.iterations
             for name, value in model.theta.items():
                 value.lerp_(theta_tilde[name].mean(dim=0), decay * self.meta_lr)
