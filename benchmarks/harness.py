@@ -70,7 +70,7 @@ def load_results(folder: Path) -> list[Result]:
 
 
 def provenance(argv: list[str]) -> Result:
-    """What it takes to run something again: command, commit, versions, machine."""
+    """What it takes to run something again: command, commit and versions."""
     commit = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False)
     return {
         "command": " ".join(["python", *_command(argv)]),

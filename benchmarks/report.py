@@ -15,7 +15,7 @@ from scipy import stats
 from benchmarks.harness import Result
 from famle_agent.plots import style
 
-__all__ = ["curves", "first_crossing", "interquartile_mean", "plot_curves", "quartiles", "solved_at", "summary"]
+__all__ = ["by_method", "first_crossing", "interquartile_mean", "plot_curves", "quartiles", "solved_at", "summary"]
 
 Array = npt.NDArray[np.float64]
 
@@ -35,14 +35,18 @@ def first_crossing(returns: Sequence[float], lengths: Sequence[int], threshold: 
     return int(np.sum(lengths[: above[0] + 1])) if len(above) else None
 
 
-def interquartile_mean(values: Sequence[float]) -> tuple[float, float, float]:
+def interquartile_mean(values: Sequence[float] | Array) -> tuple[float, float, float]:
     """The mean of the middle half and its 95 % bootstrap interval."""
     data = np.asarray(values, dtype=np.float64)
     mean = float(stats.trim_mean(data, 0.25))
     if len(data) < 2 or np.ptp(data) == 0.0:
         return mean, mean, mean
     interval = stats.bootstrap(
-        (data,), lambda x, axis: stats.trim_mean(x, 0.25, axis=axis), method="percentile", rng=np.random.default_rng(0)
+        (data,),
+        lambda x, axis: stats.trim_mean(x, 0.25, axis=axis),
+        n_resamples=2000,
+        method="percentile",
+        rng=np.random.default_rng(0),
     ).confidence_interval
     return mean, float(interval.low), float(interval.high)
 
@@ -52,7 +56,7 @@ def quartiles(values: Any) -> Array:
     return np.percentile(np.asarray(values, dtype=np.float64), [25, 50, 75], axis=0)
 
 
-def curves(results: Sequence[Result]) -> Mapping[str, list[Result]]:
+def by_method(results: Sequence[Result]) -> Mapping[str, list[Result]]:
     """The results by method."""
     methods: dict[str, list[Result]] = {}
     for result in results:
@@ -64,7 +68,7 @@ def summary(results: Sequence[Result], threshold: float, title: str, within: int
     """One row a method: first episodes, solved-at, the fraction solved in time, time per step."""
     columns = ("method", "n", "1st episode", "IQM [95 %]", "2nd episode", "last", "solved at", "1st crossing")
     table = Table(*columns, f"solved <= {within}", "ms / step", title=title)
-    for method, runs in curves(results).items():
+    for method, runs in by_method(results).items():
         first, second, last = ([run["returns"][i] for run in runs] for i in (0, 1, -1))
         solved = [solved_at(run["returns"], run["lengths"], threshold) for run in runs]
         crossed = [first_crossing(run["returns"], run["lengths"], threshold) for run in runs]
@@ -87,7 +91,7 @@ def plot_curves(results: Sequence[Result], threshold: float, title: str, path: P
     """The paper's figure 3: median return and quartiles over the robot's steps, a colour a method."""
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     axes = figure.add_subplot()
-    for method, runs in curves(results).items():
+    for method, runs in by_method(results).items():
         length = min(len(run["returns"]) for run in runs)
         x = np.median([np.cumsum(run["lengths"][:length]) for run in runs], axis=0)
         low, median, high = quartiles([run["returns"][:length] for run in runs])

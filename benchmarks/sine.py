@@ -31,10 +31,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
-from scipy.stats import bootstrap, trim_mean
+from scipy.stats import trim_mean
 from torch import Tensor
 
 from benchmarks.harness import Result, provenance, write_json
+from benchmarks.report import interquartile_mean, quartiles
 from famle_agent.adaptation import Memory, adapt, prior
 from famle_agent.dynamics import Dynamics
 from famle_agent.inner_loop import InnerLoop
@@ -143,11 +144,6 @@ def first(points: Memory, n: int) -> Memory:
     return Memory(points.obs[:, :n], points.action[:, :n], points.next_obs[:, :n], points.weight[:, :n])
 
 
-def interquartile_mean(values: NDArray[np.float64], axis: int = -1) -> NDArray[np.float64]:
-    """Mean of the middle half."""
-    return np.asarray(trim_mean(values, 0.25, axis=axis))
-
-
 def meta_learn(learn: Reptile | MAML, data: Memory, n_situations: int, inner_loop: InnerLoop, seed: int) -> Learner:
     """Meta-trains a fresh model of ``n_situations`` embeddings."""
     torch.manual_seed(seed)
@@ -164,7 +160,7 @@ def choose_rates(learner: Learner, rates: tuple[InnerLoop, ...], sines: Sines, p
     """The learner with the rates of the least interquartile mean error over all validation fits."""
 
     def error(candidate: Learner) -> float:
-        return float(interquartile_mean(candidate.errors(sines, points).double().numpy().ravel()))
+        return float(trim_mean(candidate.errors(sines, points).double().numpy().ravel(), 0.25))
 
     return min((Learner(learner.model, inner_loop, learner.seconds) for inner_loop in rates), key=error)
 
@@ -197,16 +193,14 @@ def summary(errors: list[NDArray[np.float64]]) -> Result:
     The interval is over the test sines, with the meta-trained models as they are.
     """
     pooled = np.concatenate(errors)
-    lower, median, upper = np.quantile(pooled, (0.25, 0.5, 0.75))
-    interval = bootstrap(
-        (pooled,), interquartile_mean, n_resamples=2000, method="percentile", rng=np.random.default_rng(0)
-    ).confidence_interval
+    lower, median, upper = quartiles(pooled)
+    mean, low, high = interquartile_mean(pooled)
     return {
         "median": float(median),
         "quartiles": [float(lower), float(upper)],
-        "iqm": float(interquartile_mean(pooled)),
-        "iqm_interval": [float(interval.low), float(interval.high)],
-        "iqm_per_replicate": [float(interquartile_mean(values)) for values in errors],
+        "iqm": mean,
+        "iqm_interval": [low, high],
+        "iqm_per_replicate": [float(trim_mean(values, 0.25)) for values in errors],
     }
 
 

@@ -10,7 +10,7 @@ import pytest
 from benchmarks import reacher
 from benchmarks.harness import Replicate, load_results, run_replicates
 from benchmarks.identification import accuracy, across_the_wrap
-from benchmarks.report import curves, first_crossing, interquartile_mean, plot_curves, solved_at, summary
+from benchmarks.report import by_method, first_crossing, interquartile_mean, plot_curves, solved_at, summary
 from famle_agent import FAMLE, Transitions
 from famle_envs.reacher import ReacherEnv
 
@@ -84,7 +84,7 @@ def test_summary_and_picture_cover_all_methods(tmp_path: Path) -> None:
     assert cells[2] == ["6.0 (5.5-6.5)"] * 2
     assert cells[6] == ["100"] * 2
     assert cells[8] == ["3/3"] * 2
-    assert list(curves(results)) == ["a", "b"]
+    assert list(by_method(results)) == ["a", "b"]
     plot_curves(results, 30.0, "title", tmp_path / "curves.png", steps=200)
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
 
