@@ -16,7 +16,7 @@ __all__ = ["FAMLE"]
 class FAMLE(ModelBasedAgent):
     """Meta-learns one network and one embedding per situation in simulation; picks and adapts them on the robot.
 
-    Arguments as for :class:`~famle_agent.agent.ModelBasedAgent`.
+    Arguments as for :class:`~famle_agent.simulation.SimulationLearner`.
 
     Example:
         >>> from famle_agent import FAMLE
