@@ -18,7 +18,7 @@ from rich.console import Console
 
 from benchmarks.harness import provenance, write_json
 from famle_agent import FAMLE, Transitions
-from famle_agent.adaptation import situation_log_likelihood
+from famle_agent.adaptation import Candidates
 from famle_agent.dynamics import Dynamics
 
 _BASE, _TIP = 0, slice(10, 12)  # of the reacher's observation
@@ -68,7 +68,7 @@ def accuracy(model: Dynamics, data: Transitions, size: int, windows: int, wrap: 
         if wrap:
             part = across_the_wrap(part, size // 2)
         batch = model.encode(*(torch.as_tensor(values) for values in (part.obs, part.action, part.next_obs)))
-        named = situation_log_likelihood(model, batch).argmax(dim=1)
+        named = Candidates.of(model, compose=False).log_likelihood(model, batch).sum(dim=1).argmax(dim=1)
         right += int((named == torch.arange(len(part.situations))).sum())
     return right / (windows * len(data.situations))
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -36,7 +36,7 @@ from torch import Tensor
 
 from benchmarks.harness import Result, provenance, write_json
 from benchmarks.report import interquartile_mean, quartiles
-from famle_agent.adaptation import Memory, adapt, prior
+from famle_agent.adaptation import Candidates, Memory, adapt, prior
 from famle_agent.dynamics import Dynamics
 from famle_agent.inner_loop import InnerLoop
 from famle_agent.maml import MAML
@@ -108,7 +108,8 @@ class Sines:
         """The transitions x -> x + y at n random places on each sine."""
         x = 10.0 * torch.rand(len(self.phase), n, generator=generator) - 5.0
         obs, next_obs = x[..., None], (x + self(x))[..., None]
-        return Memory(obs, torch.zeros(*x.shape, 0), next_obs, torch.ones_like(x))
+        nothing = torch.zeros(*x.shape, 0)
+        return Memory(obs, nothing, next_obs, log_p=nothing, weight=torch.ones_like(x))
 
 
 @dataclass(frozen=True)
@@ -127,8 +128,10 @@ class Learner:
 
     def fit(self, points: Memory) -> Tensor:
         """Algorithm 2's lines 6 and 7, then y on GRID for each of B sines, (B, 200)."""
-        sines = len(points.weight)
-        belief = adapt(self.model, points, self.inner_loop, prior(self.model, sines))
+        sines, alone = len(points.weight), Candidates.of(self.model, compose=False)
+        data = self.model.encode(points.obs, points.action, points.next_obs, points.weight)
+        points = replace(points, log_p=alone.log_likelihood(self.model, data))
+        belief = adapt(self.model, alone, points, self.inner_loop, prior(self.model, alone, sines))
         x = GRID.expand(sines, -1)[..., None]
         simulator = self.model.simulator(belief.theta, belief.h)
         return (simulator(x, torch.zeros(sines, len(GRID), 0)) - x)[..., 0].detach()
@@ -141,7 +144,7 @@ class Learner:
 
 def first(points: Memory, n: int) -> Memory:
     """The first n points of each sine."""
-    return Memory(points.obs[:, :n], points.action[:, :n], points.next_obs[:, :n], points.weight[:, :n])
+    return Memory(**{name: values[:, :n] for name, values in vars(points).items()})
 
 
 def meta_learn(learn: Reptile | MAML, data: Memory, n_situations: int, inner_loop: InnerLoop, seed: int) -> Learner:

@@ -1,7 +1,12 @@
-"""Algorithm 2 of the paper: the most likely embedding, then k gradient steps on theta and h."""
+"""Algorithm 2 of the paper: the most likely embedding, then k gradient steps on theta and h.
+
+Beside the embeddings of the training situations, their sums can be candidates too: where h enters a model linearly,
+h_i + h_j - h_0 is the situation with both faults, if h_0 is the intact robot.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,7 +15,7 @@ from torch import Tensor
 from famle_agent.dynamics import Batch, Dynamics, Theta, expand
 from famle_agent.inner_loop import InnerLoop
 
-__all__ = ["Belief", "Memory", "adapt", "prior", "situation_log_likelihood"]
+__all__ = ["Belief", "Candidates", "Memory", "adapt", "prior"]
 
 
 @dataclass(frozen=True)
@@ -21,20 +26,26 @@ class Memory:
         obs: (B, M, obs_dim).
         action: In [-1, 1], (B, M, action_dim).
         next_obs: (B, M, obs_dim).
+        log_p: Log-likelihood of each transition under each candidate, (B, M, C). It does not change as long as
+            theta_meta does not, so that it is computed once for each transition.
         weight: 1 for a transition, 0 for a place that is empty yet, (B, M).
     """
 
     obs: Tensor
     action: Tensor
     next_obs: Tensor
+    log_p: Tensor
     weight: Tensor
 
     @classmethod
-    def empty(cls, robots: int, size: int, obs_dim: int, action_dim: int, device: torch.device) -> Memory:
+    def empty(
+        cls, robots: int, size: int, obs_dim: int, action_dim: int, candidates: int, device: torch.device
+    ) -> Memory:
         """A memory of ``size`` M for B robots that have seen nothing."""
-        obs = torch.zeros(robots, size, obs_dim, device=device)
-        scalar = torch.zeros(robots, size, device=device)
-        return cls(obs, torch.zeros(robots, size, action_dim, device=device), obs, scalar)
+        obs, action, log_p = (
+            torch.zeros(robots, size, dim, device=device) for dim in (obs_dim, action_dim, candidates)
+        )
+        return cls(obs, action, obs, log_p, torch.zeros(robots, size, device=device))
 
     def resized(self, size: int) -> Memory:
         """The newest ``size`` places, with empty ones in front where there are fewer."""
@@ -43,9 +54,9 @@ class Memory:
             empty = values.new_zeros(len(values), size, *values.shape[2:])
             return torch.cat([empty, values], dim=1)[:, -size:]
 
-        return Memory(fit(self.obs), fit(self.action), fit(self.next_obs), fit(self.weight))
+        return Memory(fit(self.obs), fit(self.action), fit(self.next_obs), fit(self.log_p), fit(self.weight))
 
-    def add(self, obs: Tensor, action: Tensor, next_obs: Tensor, valid: Tensor) -> Memory:
+    def add(self, obs: Tensor, action: Tensor, next_obs: Tensor, log_p: Tensor, valid: Tensor) -> Memory:
         """Inserts one transition per robot where ``valid`` (B,), and drops that robot's oldest."""
 
         def push(old: Tensor, new: Tensor) -> Tensor:
@@ -56,90 +67,145 @@ class Memory:
             push(self.obs, obs),
             push(self.action, action),
             push(self.next_obs, next_obs),
+            push(self.log_p, log_p),
             push(self.weight, torch.ones_like(valid, dtype=obs.dtype)),
         )
 
 
 @dataclass(frozen=True)
-class Belief:
-    """What B robots believe about their situation.
+class Candidates:
+    """The embeddings among which the most likely one is selected.
 
     Attributes:
-        theta: theta*, stacked parameters.
-        h: h*, (B, embedding_dim).
-        log_likelihood: Sum over the memory of log p(s' | s, a, h) for each training situation, (B, N).
+        h: (P, C, embedding_dim), those of the N training situations first.
+        pairs: What each consists of, (C, 2): the situations i and j; j = 0 where it is i alone.
+    """
+
+    h: Tensor
+    pairs: Tensor
+
+    @classmethod
+    def of(cls, model: Dynamics, compose: bool) -> Candidates:
+        """H_meta, and with ``compose`` the sums of two situations other than the first, which is the intact robot."""
+        n = model.n_situations
+        alone = torch.stack([torch.arange(n), torch.zeros(n, dtype=torch.long)], dim=1)
+        both = torch.combinations(torch.arange(1, n)) if compose else alone[:0]
+        pairs = torch.cat([alone, both]).to(model.embeddings.device)
+        H = model.embeddings.detach()
+        h = H[:, pairs[:, 0]] + H[:, pairs[:, 1]] - H[:, :1]
+        return cls(h, pairs)
+
+    @property
+    def log_prior(self) -> Tensor:
+        """One fault is as likely as two, (C,)."""
+        single = self.pairs[:, 1] == 0
+        size = torch.where(single, single.sum(), (~single).sum())
+        return -size.float().log()
+
+    def marginal(self, posterior: Tensor) -> Tensor:
+        """How likely each training situation is, alone or as a part: (B, C) -> (B, N)."""
+        n = int((self.pairs[:, 1] == 0).sum())
+        total = posterior.clone()[:, :n]
+        both, (i, j) = posterior[:, n:], self.pairs[n:].T
+        return total.index_add(1, i, both).index_add(1, j, both)
+
+    def names(self, situations: Sequence[str]) -> list[str]:
+        """What the candidates are called, given the names of the training situations."""
+        return [situations[i] if j == 0 else f"{situations[i]} + {situations[j]}" for i, j in self.pairs.tolist()]
+
+    def log_likelihood(self, model: Dynamics, data: Batch) -> Tensor:
+        """Log p(s' | s, a, theta_meta, h) of the data of B robots for each candidate, a mean over the ensemble.
+
+        Args:
+            model: Holds theta_meta.
+            data: Encoded transitions of the B robots.
+
+        Returns:
+            (B, n, C); 0 for padding.
+        """
+        robots, n = data.weight.shape
+        members, size, _ = self.h.shape
+
+        # Every robot's data under each candidate, side by side in each member's network: P networks, C * B * n rows.
+        def rows(values: Tensor) -> Tensor:
+            flat = values.reshape(1, 1, robots * n, *values.shape[2:])
+            return flat.expand(members, size, *flat.shape[2:]).flatten(1, 2)
+
+        h = self.h.repeat_interleave(robots * n, dim=1)
+        batch = Batch(rows(data.x), rows(data.y), rows(data.weight))
+        log_p = model.log_likelihood(model.parameters_by_name(), h, batch)
+        # An observation beyond all measure would make every likelihood -inf and the posterior meaningless.
+        return log_p.view(members, size, robots, n).mean(dim=0).permute(1, 2, 0).clamp(min=-1e30)
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What B robots believe about their situation, in each of the P members of the ensemble.
+
+    Attributes:
+        theta: theta*, stacked parameters, (B * P, ...).
+        h: h*, (B * P, embedding_dim).
+        log_posterior: Log P(candidate | memory) but for a constant, (B, C).
         adaptations: How often the robots have adapted.
     """
 
     theta: Theta
     h: Tensor
-    log_likelihood: Tensor
+    log_posterior: Tensor
     adaptations: int = 0
 
     @property
     def posterior(self) -> Tensor:
-        """P(situation | memory) under a uniform prior, (B, N)."""
-        return torch.softmax(self.log_likelihood, dim=1)
+        """P(candidate | memory), (B, C)."""
+        return torch.softmax(self.log_posterior, dim=1)
 
     def is_finite(self) -> Tensor:
         """For which robots all parameters are finite numbers, (B,)."""
-        values = [value.flatten(start_dim=1) for value in (*self.theta.values(), self.h)]
+        robots = len(self.log_posterior)
+        values = [value.reshape(robots, -1) for value in (*self.theta.values(), self.h)]
         return torch.cat(values, dim=1).isfinite().all(dim=1)
 
     def where(self, kept: Tensor, other: Belief) -> Belief:
         """This belief for the robots in ``kept`` (B,), and the other one for the rest."""
 
         def choose(mine: Tensor, theirs: Tensor) -> Tensor:
-            return torch.where(kept.view(-1, *[1] * (mine.ndim - 1)), mine, theirs)
+            rows = kept.repeat_interleave(len(mine) // len(kept))
+            return torch.where(rows.view(-1, *[1] * (mine.ndim - 1)), mine, theirs)
 
         theta = {name: choose(value, other.theta[name]) for name, value in self.theta.items()}
-        likelihood = choose(self.log_likelihood, other.log_likelihood)
-        return Belief(theta, choose(self.h, other.h), likelihood, self.adaptations)
+        log_posterior = choose(self.log_posterior, other.log_posterior)
+        return Belief(theta, choose(self.h, other.h), log_posterior, self.adaptations)
 
 
-def prior(model: Dynamics, robots: int) -> Belief:
+def prior(model: Dynamics, candidates: Candidates, robots: int) -> Belief:
     """What B robots believe before they have seen anything: theta_meta, and the first situation's embedding."""
     theta = expand(model.parameters_by_name(), robots)
-    h = model.embeddings.detach()[0].expand(robots, -1)
-    return Belief(theta, h, torch.zeros(robots, model.n_situations, device=h.device))
+    h = model.embeddings.detach()[:, 0].repeat(robots, 1)
+    return Belief(theta, h, candidates.log_prior.expand(robots, -1))
 
 
 @torch.no_grad()
-def adapt(model: Dynamics, memory: Memory, inner_loop: InnerLoop, belief: Belief) -> Belief:
+def adapt(model: Dynamics, candidates: Candidates, memory: Memory, inner_loop: InnerLoop, belief: Belief) -> Belief:
     """Lines 6 and 7 of Algorithm 2 for B robots at once.
 
     Args:
         model: Holds theta_meta and H_meta.
+        candidates: The embeddings to select from.
         memory: D_M.
         inner_loop: k steps of gradient descent; where they diverge, theta_meta and the embedding stay.
         belief: The belief until now; of it only the number of adaptations lives on.
     """
+    robots, members = len(memory.weight), model.members
+
+    # h_likely = argmax log p(D_M | theta_meta, h) over the candidates (line 6).
+    log_posterior = candidates.log_prior + (memory.log_p * memory.weight[..., None]).sum(dim=1)
+    h_likely = candidates.h[:, log_posterior.argmax(dim=1)].transpose(0, 1).flatten(0, 1)
+
+    # theta*, h* = k steps from theta_meta, h_likely (line 7), each member of the ensemble by itself.
+    theta_meta = expand(model.parameters_by_name(), robots)
+    start = Belief(theta_meta, h_likely, log_posterior, belief.adaptations + 1)
     data = model.encode(memory.obs, memory.action, memory.next_obs, memory.weight)
-
-    # h_likely = argmax log p(D_M | theta_meta, h) over H_meta (line 6).
-    log_likelihood = situation_log_likelihood(model, data)
-    h_likely = model.embeddings[log_likelihood.argmax(dim=1)]
-
-    # theta*, h* = k steps from theta_meta, h_likely (line 7).
-    start = Belief(expand(model.parameters_by_name(), len(h_likely)), h_likely, log_likelihood, belief.adaptations + 1)
-    theta, h, _ = inner_loop(model, start.theta, start.h, lambda: data)
+    seen = Batch(*(values.repeat_interleave(members, dim=0) for values in (data.x, data.y, data.weight)))
+    theta, h, _ = inner_loop(model, start.theta, start.h, lambda: seen)
     adapted = replace(start, theta=theta, h=h)
     return adapted.where(adapted.is_finite(), start)  # steps that diverged are no steps
-
-
-@torch.no_grad()
-def situation_log_likelihood(model: Dynamics, data: Batch) -> Tensor:
-    """Log p(D | theta_meta, h) of the data of B robots for each of the N embeddings, (B, N)."""
-    robots, n = data.weight.shape
-    situations = model.n_situations
-    # Every robot's data side by side in each situation's network: N networks, B * n rows.
-    rows = Batch(
-        *(
-            value.reshape(1, robots * n, *value.shape[2:]).expand(situations, -1, *value.shape[2:])
-            for value in (data.x, data.y, data.weight)
-        )
-    )
-    theta = expand(model.parameters_by_name(), situations)
-    log_p = model.log_likelihood(theta, model.embeddings, rows)
-    # An observation beyond all measure would make every likelihood -inf and the posterior meaningless.
-    return log_p.view(situations, robots, n).sum(dim=2).T.clamp(min=-1e30)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import replace
-from typing import Any
+from importlib.resources import as_file
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,12 +17,15 @@ from torch import Tensor
 from typing_extensions import Self
 
 from famle_agent.adaptation import Belief, Memory
-from famle_agent.checkpoint import File, load_agent, save_agent
+from famle_agent.checkpoint import File, load_agent, load_pretrained, restore_agent, save_agent
 from famle_agent.dashboard import log_posterior
 from famle_agent.online import OnlineLoop, OnlineState
 from famle_agent.planning import Planner, RewardFn
 from famle_agent.simulation import SimulationLearner
 from famle_agent.units import check_action, check_observation
+
+if TYPE_CHECKING:
+    from importlib.resources.abc import Traversable
 
 __all__ = ["ModelBasedAgent"]
 
@@ -46,6 +51,10 @@ class ModelBasedAgent(SimulationLearner):
     @abstractmethod
     def _prior(self, robots: int) -> Belief:
         """What B robots believe before they have seen anything."""
+
+    @abstractmethod
+    def _log_likelihood(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
+        """How well each candidate explains a transition of each of B robots, (B, C); actions in [-1, 1]."""
 
     @abstractmethod
     def _adapt(self, memory: Memory, belief: Belief) -> Belief:
@@ -107,7 +116,7 @@ class ModelBasedAgent(SimulationLearner):
             self.logger.record("rollout/ep_rew_last", self.ep_info_buffer[-1]["r"])
         posterior = self.posterior(state)
         self.logger.record("adapt/situation", max(posterior, key=lambda name: posterior[name]), exclude="tensorboard")
-        log_posterior(self.logger, posterior)
+        log_posterior(self.logger, self.marginals(state))
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
 
@@ -211,19 +220,24 @@ class ModelBasedAgent(SimulationLearner):
         """What the agent believes of its robots now; of one robot where it has seen none."""
         return (self._live or self._state_of(1)).belief
 
+    @abstractmethod
     def posterior(self, state: OnlineState | None = None) -> dict[str, float]:
         """P(situation | memory) by name, of the first robot; of what the agent believes now, or of a state."""
-        belief = self.belief if state is None else state.belief
-        return dict(zip(self.situations, belief.posterior[0].tolist(), strict=True))
+
+    @abstractmethod
+    def marginals(self, state: OnlineState | None = None) -> dict[str, float]:
+        """How likely each training situation is, alone or as a part of what is wrong; arguments as there."""
 
     def _loop(self) -> OnlineLoop:
         model = self._require_dynamics()
         return OnlineLoop(
             prior=self._prior,
+            log_likelihood=self._log_likelihood,
             adapt=self._adapt,
             simulator=lambda belief: model.simulator(belief.theta, belief.h),
             reward_fn=self._unit_reward_fn(),
             planner=self.planner,
+            members=model.members,
             adapt_every=self.hyperparameters.adapt_every,
             forget_at_reset=self.hyperparameters.forget_at_reset,
         )
@@ -232,8 +246,8 @@ class ModelBasedAgent(SimulationLearner):
         """What the agent believes now where that fits the number of robots, else what it meta-learned."""
         if self._live is not None and self._live.robots == robots:
             return replace(self._live, last=None)
-        model, M = self._require_dynamics(), self.hyperparameters.memory_size
-        return self._loop().begin(Memory.empty(robots, M, model.obs_dim, model.action_dim, self.device))
+        model, M, C = self._require_dynamics(), self.hyperparameters.memory_size, len(self._prior(1).log_posterior[0])
+        return self._loop().begin(Memory.empty(robots, M, model.obs_dim, model.action_dim, C, self.device))
 
     # --- saving and loading -----------------------------------------------------------------------------
 
@@ -272,6 +286,13 @@ class ModelBasedAgent(SimulationLearner):
                 ``reward_fn`` is needed.
         """
         return load_agent(cls, path, env, device=device, reward_fn=reward_fn, **overrides)
+
+    def _restore(self, file: Path) -> None:
+        restore_agent(self, file)
+
+    def _load_pretrained(self, file: Traversable) -> None:
+        with as_file(file) as path:
+            load_pretrained(self, path)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ([] if self.dynamics is None else ["dynamics"]), []

@@ -26,10 +26,18 @@ from famle_agent.online import OnlineState
 if TYPE_CHECKING:
     from famle_agent.agent import ModelBasedAgent
 
-__all__ = ["File", "load_agent", "read_checkpoint", "save_agent", "write_checkpoint"]
+__all__ = [
+    "File",
+    "load_agent",
+    "load_pretrained",
+    "read_checkpoint",
+    "restore_agent",
+    "save_agent",
+    "write_checkpoint",
+]
 
 _FORMAT = "famle-agent"
-_VERSION = 1
+_VERSION = 2
 _DAMAGE = (
     *(zipfile.BadZipFile, zlib.error, EOFError, KeyError, SafetensorError),
     *(ValueError, RuntimeError, NotImplementedError),  # what zipfile and json make of flipped bits
@@ -102,6 +110,7 @@ def save_agent(agent: ModelBasedAgent, file: File) -> None:
         "observation_space": _box_to_json(agent.observation_space),
         "action_space": _box_to_json(agent.action_space),
         "angle_dims": list(agent._angle_dims),
+        "quaternion_dims": list(agent._quaternion_dims),
         "situations": list(agent.situations),
         "env": agent._env_spec,
         "needs_reward_fn": agent._reward_fn is not None,
@@ -132,7 +141,8 @@ def load_agent(
         observation_space, action_space = (_box_from_json(meta[f"{name}_space"]) for name in ("observation", "action"))
         situations = tuple(str(name) for name in list(meta["situations"]))
         settings = Hyperparameters.from_dict(meta["hyperparameters"]).to_dict()
-        mode, seed, angle_dims, live = meta["mode"], meta["seed"], tuple(meta["angle_dims"]), meta["live"]
+        mode, seed, live = meta["mode"], meta["seed"], meta["live"]
+        dims = {name: tuple(meta[name]) for name in ("angle_dims", "quaternion_dims")}
         needs_reward_fn, named_env = meta["needs_reward_fn"], meta["env"]
         env = _named_env(named_env) if env is None else env
     except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -145,7 +155,7 @@ def load_agent(
     if env is not None:
         env = make_env(env)
         _check_env(env, observation_space, action_space)
-    agent = cls(env, mode, reward_fn=reward_fn, angle_dims=angle_dims, device=device, **{**settings, **overrides})
+    agent = cls(env, mode, reward_fn=reward_fn, device=device, pretrained=False, **{**settings, **dims, **overrides})
     agent.situations, agent.seed = situations, seed
     if env is None:
         agent.observation_space, agent.action_space, agent.n_envs = observation_space, action_space, 1
@@ -156,6 +166,43 @@ def load_agent(
             f"The file's weights do not fit its settings; it is damaged, or an override changed the network: {error}"
         ) from error
     return agent
+
+
+def restore_agent(agent: ModelBasedAgent, file: File) -> None:
+    """Gives an agent the weights, the belief and the random numbers of a stored agent with the same settings.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is damaged, or its weights are of other settings.
+    """
+    meta, tensors = read_checkpoint(file)
+    try:
+        agent.situations = tuple(str(name) for name in meta["situations"])
+        _restore_tensors(agent, tensors, meta["live"])
+    except (KeyError, RuntimeError, TypeError) as error:
+        raise ValueError(f"{file} does not fit the agent's settings, or it is damaged: {error}") from error
+
+
+def load_pretrained(agent: ModelBasedAgent, file: File) -> None:
+    """Gives an agent the model of a shipped one, if that is of the same kind, environment and settings of learning."""
+    meta, tensors = read_checkpoint(file)
+    alike = (
+        meta["class"] == type(agent).__name__
+        and _world(meta["env"]) == _world(agent._env_spec)
+        and Hyperparameters.from_dict(meta["hyperparameters"]).learnt_alike(agent.hyperparameters)
+    )
+    if alike:
+        agent.situations = tuple(meta["situations"])
+        weights = {name: value for name, value in tensors.items() if name.startswith("dynamics/")}
+        _restore_tensors(agent, weights, None)
+
+
+def _world(env: dict[str, Any] | None) -> dict[str, Any] | None:
+    """What of an environment's description matters to a model of all its situations."""
+    if env is None:
+        return None
+    kwargs = {key: value for key, value in env["kwargs"].items() if key not in ("situation", "render_mode")}
+    return {"id": env["id"], "kwargs": kwargs}
 
 
 def _named_env(named: dict[str, Any] | None) -> gym.Env[Any, Any] | None:
@@ -190,7 +237,10 @@ def _restore_tensors(agent: ModelBasedAgent, tensors: dict[str, Tensor], live: d
     if live is not None:
         state = {name: value.to(agent.device) for name, value in part("live").items()}
         settings = agent.hyperparameters
-        agent._live = OnlineState.from_tensors(state, **live).resized(settings.memory_size, settings.horizon)
+        stored = OnlineState.from_tensors(state, **live).resized(settings.memory_size, settings.horizon)
+        # With other candidates than the stored agent's, what it has seen cannot be judged by what it knew of them.
+        comparable = stored.belief.log_posterior.shape == agent._prior(stored.robots).log_posterior.shape
+        agent._live = stored if comparable else None
     if agent.device.type == "cpu" and "generator/state" in tensors:
         agent._generator.set_state(tensors["generator/state"])
 

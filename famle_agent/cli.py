@@ -54,6 +54,10 @@ class MetaLearn:
     """"ours" or "paper"."""
     seed: int = 0
     """Seed of everything."""
+    jobs: int = -1
+    """Processes that simulate, -1 for one a core."""
+    folder: Path | None = None
+    """Folder for the transitions and the models on the way; the same command goes on where it was stopped."""
     tensorboard: Path | None = None
     """Folder for TensorBoard."""
 
@@ -61,7 +65,7 @@ class MetaLearn:
         """Meta-learns and saves."""
         log = None if self.tensorboard is None else str(self.tensorboard)
         agent = FAMLE(self.robot, self.mode, seed=self.seed, tensorboard_log=log)
-        agent.meta_learn(progress_bar=True).save(self.out)
+        agent.meta_learn(progress_bar=True, n_jobs=self.jobs, folder=self.folder).save(self.out)
         Console().print(f"Saved {self.out}.")
 
 

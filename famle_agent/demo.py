@@ -71,7 +71,7 @@ def run_episode(
         if logger is not None:
             env.agent.num_timesteps += 1
             logger.record("step/reward", float(reward))
-            log_posterior(logger, info["famle"]["posterior"])
+            log_posterior(logger, env.agent.marginals())
             logger.dump(env.agent.num_timesteps)
     belief = info["famle"]
     return Episode(total, belief["situation"], belief["probability"], seconds / steps, frames)

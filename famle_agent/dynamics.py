@@ -1,8 +1,8 @@
 """The situation-conditioned dynamics model p_theta(s' | s, a, h) (the paper's section IV-A).
 
-Every function takes a leading axis B: B situations while meta-learning, B robots while deployed, B
-embeddings while the most likely one is selected. Parameters are stacked along it, so that B networks
-cost one batched matrix product a layer.
+Every function takes a leading axis B of independent networks: situations while meta-learning, robots while deployed,
+and in each of these the P members of an ensemble, which see the same transitions (index = robot * P + member).
+Parameters are stacked along it, so that B networks cost one batched matrix product a layer.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations_with_replacement, pairwise
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +24,7 @@ Theta = dict[str, Tensor]
 Network = list[tuple[Tensor, Tensor]]
 """Layers (weight (B, in, out), bias (B, 1, out)) of B networks whose situation is fixed."""
 
+_NOISE_SAMPLES = 50_000  # transitions that the noise is fitted to
 _MIN_STD = 1e-3  # of a normalised target; keeps the likelihood finite where the model is exact
 
 
@@ -43,20 +44,28 @@ class Batch:
 
 
 def expand(theta: Theta, size: int) -> Theta:
-    """Shows one set of parameters B times, without copying."""
-    return {name: value.expand(size, *value.shape) for name, value in theta.items()}
+    """The parameters of P members (P, ...) for each of some robots or situations, (size * P, ...)."""
+    if size == 1:
+        return theta
+    return {name: value.expand(size, *value.shape).flatten(0, 1) for name, value in theta.items()}
 
 
 class Dynamics(nn.Module):
-    """Gaussian p(s' | s, a, h): a network predicts the normalised change of the state.
+    """Gaussian or Student-t p(s' | s, a, h): a network predicts the normalised change of the state.
 
     Angles enter as sine and cosine, and their change is taken the short way round, so that a jump from pi to
-    -pi is no event. The embedding h enters the first layer as a bias, which is what concatenating it to the
+    -pi is no event. A quaternion q enters as the products q_i q_j, in which a rotation is linear and q and -q are
+    the same. The embedding h enters the first layer as a bias, which is what concatenating it to the
     input amounts to. With ``gate_actions``, it scales each action too,
 
         a' = (1 + G^T h) * a,
 
-    so that a motor's gain, its sign included, is linear in h instead of something to be learnt piecewise.
+    so that a motor's gain, its sign included, is linear in h instead of something to be learnt piecewise. With an
+    ``interaction_rank`` R, a bilinear map of rank R joins the first layer,
+
+        z = W^T x + C^T ((U^T x) * (V^T h)),
+
+    in which a sensor that is turned is linear in h. What is linear in h adds up: two faults are the sum of theirs.
 
     Args:
         obs_dim: Number of observation dimensions.
@@ -65,11 +74,16 @@ class Dynamics(nn.Module):
         embedding_dim: Size of an embedding.
         hidden: Width of each hidden layer.
         angle_dims: Observation dimensions that are angles in rad.
+        quaternion_dims: The four observation dimensions of a unit quaternion, or none.
         gate_actions: Whether the embedding scales the actions; False is the paper's network.
+        interaction_rank: R; 0 is the paper's network.
+        members: P, independent networks with embeddings of their own; 1 is the paper's.
+        degrees_of_freedom: Of a Student-t likelihood, which forgives what no model predicts, contacts above all;
+            0 is a Gaussian (the paper's).
 
     Attributes:
-        theta: Parameters by name, without the axis B.
-        embeddings: H, the embedding of each training situation, (N, embedding_dim).
+        theta: Parameters of the members by name, (P, ...).
+        embeddings: H, the embedding of each training situation, (P, N, embedding_dim).
     """
 
     input_mean: Tensor
@@ -86,57 +100,88 @@ class Dynamics(nn.Module):
         embedding_dim: int = 5,
         hidden: Sequence[int] = (70, 50),
         angle_dims: Sequence[int] = (),
+        quaternion_dims: Sequence[int] = (),
         gate_actions: bool = True,
+        interaction_rank: int = 0,
+        members: int = 1,
+        degrees_of_freedom: float = 0.0,
     ) -> None:
         super().__init__()
         self.obs_dim, self.action_dim = obs_dim, action_dim
-        self.gate_actions = gate_actions
-        self.angle_dims = list(angle_dims)
-        self.other_dims = [dim for dim in range(obs_dim) if dim not in set(angle_dims)]
-        self.n_features = len(self.other_dims) + 2 * len(self.angle_dims)
+        self.gate_actions, self.interaction_rank = gate_actions, interaction_rank
+        self.degrees_of_freedom = degrees_of_freedom
+        self.angle_dims, self.quaternion_dims = list(angle_dims), list(quaternion_dims)
+        special = {*angle_dims, *quaternion_dims}
+        self.other_dims = [dim for dim in range(obs_dim) if dim not in special]
+        pairs = list(combinations_with_replacement(self.quaternion_dims, 2))
+        self._left, self._right = [i for i, _ in pairs], [j for _, j in pairs]
+        self.n_features = len(self.other_dims) + 2 * len(self.angle_dims) + len(pairs)
         self.n_layers = len(hidden) + 1
 
         sizes = [self.n_features + action_dim, *hidden, obs_dim]
         theta = {}
         for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
-            theta[f"weight_{layer}"] = torch.randn(fan_in, fan_out) / math.sqrt(fan_in)
-            theta[f"bias_{layer}"] = torch.zeros(fan_out)
-        theta["embedding"] = torch.randn(embedding_dim, sizes[1]) / math.sqrt(sizes[0] + embedding_dim)
+            theta[f"weight_{layer}"] = torch.randn(members, fan_in, fan_out) / math.sqrt(fan_in)
+            theta[f"bias_{layer}"] = torch.zeros(members, fan_out)
+        theta["embedding"] = torch.randn(members, embedding_dim, sizes[1]) / math.sqrt(sizes[0] + embedding_dim)
         if gate_actions:
-            theta["gate"] = torch.randn(embedding_dim, action_dim) / math.sqrt(embedding_dim)
+            theta["gate"] = torch.randn(members, embedding_dim, action_dim) / math.sqrt(embedding_dim)
+        if interaction_rank:
+            shapes = {"input": (sizes[0], interaction_rank), "situation": (embedding_dim, interaction_rank)}
+            shapes["output"] = (interaction_rank, sizes[1])
+            for name, (fan_in, fan_out) in shapes.items():
+                theta[f"interaction_{name}"] = torch.randn(members, fan_in, fan_out) / math.sqrt(fan_in)
         self.theta = nn.ParameterDict(theta)
-        self.embeddings = nn.Parameter(torch.randn(n_situations, embedding_dim))
+        self.embeddings = nn.Parameter(torch.randn(members, n_situations, embedding_dim))
 
         self.register_buffer("input_mean", torch.zeros(self.n_features))
         self.register_buffer("input_std", torch.ones(self.n_features))
         self.register_buffer("target_mean", torch.zeros(obs_dim))
         self.register_buffer("target_std", torch.ones(obs_dim))
-        self.register_buffer("noise_std", torch.ones(obs_dim))
+        self.register_buffer("noise_std", torch.ones(members, obs_dim))
 
     @property
     def n_situations(self) -> int:
         """N, the number of embeddings."""
-        return len(self.embeddings)
+        return self.embeddings.shape[1]
+
+    @property
+    def members(self) -> int:
+        """P, the networks of the ensemble."""
+        return self.embeddings.shape[0]
 
     def parameters_by_name(self) -> Theta:
-        """Theta as plain tensors without gradient."""
+        """Theta as plain tensors without gradient, (P, ...)."""
         return {name: value.detach() for name, value in self.theta.items()}
+
+    def embeddings_of(self, c: Tensor) -> Tensor:
+        """The embeddings of situations c (B,) in every member, (B * P, embedding_dim)."""
+        return self.embeddings.detach()[:, c].transpose(0, 1).flatten(0, 1)
 
     # --- data -------------------------------------------------------------------------------------------
 
     def features(self, obs: Tensor) -> Tensor:
-        """What the network sees of observations (..., obs_dim): angles as sine and cosine."""
-        if not self.angle_dims:
+        """What the network sees of observations (..., obs_dim): sine and cosine of angles, products of quaternions."""
+        if not self.angle_dims and not self.quaternion_dims:
             return obs
-        angles = obs[..., self.angle_dims]
-        return torch.cat([obs[..., self.other_dims], angles.sin(), angles.cos()], dim=-1)
+        parts = [obs[..., self.other_dims]]
+        if self.angle_dims:
+            angles = obs[..., self.angle_dims]
+            parts += [angles.sin(), angles.cos()]
+        if self.quaternion_dims:
+            parts.append(obs[..., self._left] * obs[..., self._right])
+        return torch.cat(parts, dim=-1)
 
     def targets(self, obs: Tensor, next_obs: Tensor) -> Tensor:
-        """The change of the state, angles the short way round."""
+        """The change of the state, angles and quaternions the short way round."""
         change = next_obs - obs
         if self.angle_dims:
             angle = change[..., self.angle_dims]
             change[..., self.angle_dims] = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+        if self.quaternion_dims:
+            q, q_next = obs[..., self.quaternion_dims], next_obs[..., self.quaternion_dims]
+            nearer = torch.where((q * q_next).sum(dim=-1, keepdim=True) < 0.0, -q_next, q_next)
+            change[..., self.quaternion_dims] = nearer - q
         return change
 
     def fit_normalisation(self, obs: Tensor, next_obs: Tensor) -> None:
@@ -158,16 +203,20 @@ class Dynamics(nn.Module):
     # --- the network ------------------------------------------------------------------------------------
 
     def network(self, theta: Theta, h: Tensor) -> Network:
-        """Fixes the situation of B networks.
+        """Fixes the situation of B networks: what h does to the first layer becomes part of its weights.
 
         Args:
             theta: Stacked parameters.
             h: Embeddings, (B, embedding_dim).
         """
-        weight, bias = theta["weight_0"], theta["bias_0"] + torch.einsum("be,beo->bo", h, theta["embedding"])
+        weight = theta["weight_0"]
+        if self.interaction_rank:
+            scale = torch.einsum("be,ber->br", h, theta["interaction_situation"])
+            weight = torch.baddbmm(weight, theta["interaction_input"] * scale[:, None], theta["interaction_output"])
         if self.gate_actions:
             gate = 1.0 + torch.einsum("be,bea->ba", h, theta["gate"])
             weight = torch.cat([weight[:, : self.n_features], gate[..., None] * weight[:, self.n_features :]], dim=1)
+        bias = theta["bias_0"] + torch.einsum("be,beo->bo", h, theta["embedding"])
         layers = [(weight, bias[:, None])]
         for layer in range(1, self.n_layers):
             layers.append((theta[f"weight_{layer}"], theta[f"bias_{layer}"][:, None]))
@@ -181,28 +230,70 @@ class Dynamics(nn.Module):
         weight, bias = network[-1]
         return torch.baddbmm(bias, x, weight)
 
+    def predict(self, theta: Theta, h: Tensor, x: Tensor) -> Tensor:
+        """As :meth:`forward`, with an embedding for each row: the same networks see many situations at once.
+
+        Args:
+            theta: Stacked parameters.
+            h: (B, n, embedding_dim), or (B, 1, embedding_dim) for one situation in all rows.
+            x: Normalised inputs, (B, n, inputs).
+        """
+        if self.gate_actions:
+            gate = 1.0 + h @ theta["gate"]
+            x = torch.cat([x[..., : self.n_features], gate * x[..., self.n_features :]], dim=-1)
+        z = torch.baddbmm(theta["bias_0"][:, None], x, theta["weight_0"]) + h @ theta["embedding"]
+        if self.interaction_rank:
+            interaction = (x @ theta["interaction_input"]) * (h @ theta["interaction_situation"])
+            z = torch.baddbmm(z, interaction, theta["interaction_output"])
+        layers = range(1, self.n_layers)
+        rest = [(theta[f"weight_{layer}"], theta[f"bias_{layer}"][:, None]) for layer in layers]
+        return self.forward(rest, F.silu(z))
+
     def loss(self, theta: Theta, h: Tensor, batch: Batch) -> Tensor:
         """Negative log-likelihood L(theta, h) of unit variance, constants left out, (B,); eq. 6 of the paper.
 
         A mean over the weighted transitions and over the target dimensions.
+
+        Args:
+            theta: Stacked parameters.
+            h: (B, embedding_dim), or one for each transition, (B, n, embedding_dim).
+            batch: Transitions.
         """
-        error = (self.forward(self.network(theta, h), batch.x) - batch.y).square().mean(dim=-1)
+        error = (self.predict(theta, _rows(h), batch.x) - batch.y).square().mean(dim=-1)
         return 0.5 * (error * batch.weight).sum(dim=1) / batch.weight.sum(dim=1).clamp(min=1.0)
 
     def log_likelihood(self, theta: Theta, h: Tensor, batch: Batch) -> Tensor:
-        """Log p(s' | s, a, h) of each normalised transition, (B, n), with the fitted noise; 0 for padding."""
-        residual = (self.forward(self.network(theta, h), batch.x) - batch.y) / self.noise_std
-        density = -0.5 * residual.square() - self.noise_std.log() - 0.5 * math.log(2 * math.pi)
-        return density.sum(dim=-1) * batch.weight
+        """Log p(s' | s, a, h) of each normalised transition, (B, n), with the fitted noise; 0 for padding.
+
+        Arguments as for :meth:`loss`.
+        """
+        noise = self.noise_std.repeat(len(batch.x) // self.members, 1)[:, None]
+        residual = (self.predict(theta, _rows(h), batch.x) - batch.y) / noise
+        return (self._log_density(residual) - noise.log()).sum(dim=-1) * batch.weight
+
+    def _log_density(self, residual: Tensor) -> Tensor:
+        nu = self.degrees_of_freedom
+        if not nu:
+            return -0.5 * residual.square() - 0.5 * math.log(2 * math.pi)
+        constant = math.lgamma((nu + 1) / 2) - math.lgamma(nu / 2) - 0.5 * math.log(nu * math.pi)
+        return constant - (nu + 1) / 2 * torch.log1p(residual.square() / nu)
 
     @torch.no_grad()
     def fit_noise(self, batch: Batch) -> None:
-        """Sets the Gaussian's deviations to their maximum-likelihood values on the training situations."""
-        theta = expand(self.parameters_by_name(), self.n_situations)
-        residual = self.forward(self.network(theta, self.embeddings), batch.x) - batch.y
-        weight = batch.weight[..., None]
-        variance = (residual.square() * weight).sum(dim=(0, 1)) / weight.sum()
-        self.noise_std.copy_(variance.sqrt().clamp(min=_MIN_STD))
+        """Sets the deviations to their maximum-likelihood values on the training situations, (N, n) transitions."""
+        nu, stride = self.degrees_of_freedom, -(-batch.weight.numel() // _NOISE_SAMPLES)
+        x, y, weight = (values[:, ::stride] for values in (batch.x, batch.y, batch.weight))
+        rows = x.shape[1]
+        h = self.embeddings.repeat_interleave(rows, dim=1)  # (P, N * rows, embedding_dim)
+        x = x.flatten(0, 1).expand(self.members, -1, -1)
+        squared = (self.predict(self.parameters_by_name(), h, x) - y.flatten(0, 1)).square()
+        weight = weight.reshape(1, -1, 1)
+        variance = (squared * weight).sum(dim=1, keepdim=True) / weight.sum()
+        for _ in range(20 if nu else 0):
+            # Expectation maximisation: a Student-t is a Gaussian whose variance is drawn anew for each value.
+            trust = weight * (nu + 1) / (nu + squared / variance)
+            variance = (squared * trust).sum(dim=1, keepdim=True) / weight.sum()
+        self.noise_std.copy_(variance[:, 0].sqrt().clamp(min=_MIN_STD))
 
     def simulator(self, theta: Theta, h: Tensor) -> Simulator:
         """B models of fixed situation for planning, with the normalisation folded into their outer layers."""
@@ -232,3 +323,8 @@ class Simulator:
         """
         x = torch.cat([self._model.features(obs), action], dim=-1)
         return obs + self._model.forward(self._network, x)
+
+
+def _rows(h: Tensor) -> Tensor:
+    """Embeddings with an axis of transitions."""
+    return h if h.ndim == 3 else h[:, None]

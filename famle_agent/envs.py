@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from itertools import chain, count
 from typing import Any
 
@@ -13,6 +15,7 @@ from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import VecEnv
 
 from famle_agent.hyperparameters import known_robots
+from famle_agent.transitions import EnvSource
 from famle_envs.situation import Situation
 
 __all__ = ["EnvLike", "check_spaces", "env_attribute", "env_spec", "make_env", "situation_envs"]
@@ -76,9 +79,7 @@ def _plain_spec(env: VecEnv) -> EnvSpec | None:
     return spec
 
 
-def situation_envs(
-    env: VecEnv, envs: Sequence[EnvLike] | None
-) -> tuple[list[gym.Env[Any, Any]], list[str], list[bool]]:
+def situation_envs(env: VecEnv, envs: Sequence[EnvLike] | None) -> tuple[list[EnvSource], list[str]]:
     """One environment per training situation.
 
     Args:
@@ -86,10 +87,11 @@ def situation_envs(
         envs: What the user gave; None takes the training situations that the environment names.
 
     Returns:
-        The environments, what their situations are called, and whether each was made here and is ours to close.
+        Each environment that the user gave, or what makes it; and what their situations are called.
 
     Raises:
-        ValueError: No situation is given or known, or the environment takes no ``situation``.
+        ValueError: No situation is given or known, the environment takes no ``situation``, or the spaces of one differ
+            from the agent's.
     """
     if envs is None:
         envs = list(env_attribute(env, "training_situations", ()))
@@ -100,19 +102,22 @@ def situation_envs(
             )
     if len(envs) == 0:
         raise ValueError("meta_learn(envs) needs at least one environment, factory or Situation.")
-    made, labels, ours = [], [], []
-    for i, item in enumerate(envs):
-        is_env = isinstance(item, gym.Env)
-        made.append(_one_env(env, item))
-        situation = _get(made[-1], "situation", None)
+    sources, labels = [_source(env, item) for item in envs], list[str]()
+    for i, source in enumerate(sources):
+        made = source if isinstance(source, gym.Env) else source()
+        try:
+            _check_same_spaces(made, env)
+            situation = _get(made, "situation", None)
+        finally:
+            if made is not source:
+                made.close()
         label = situation.label if isinstance(situation, Situation) else f"situation {i}"
         names = chain([label], (f"{label} ({j})" for j in count(i)))
         labels.append(next(name for name in names if name not in labels))
-        ours.append(not is_env)
-    return made, labels, ours
+    return sources, labels
 
 
-def _one_env(env: VecEnv, item: EnvLike) -> gym.Env[Any, Any]:
+def _source(env: VecEnv, item: EnvLike) -> EnvSource:
     if isinstance(item, gym.Env):
         return item
     if isinstance(item, (Situation, Mapping, str)):
@@ -121,14 +126,31 @@ def _one_env(env: VecEnv, item: EnvLike) -> gym.Env[Any, Any]:
             raise ValueError(
                 "Situations need a registered environment without wrappers; give environments or factories instead."
             )
-        try:
-            return gym.make(spec.id, **{**spec.kwargs, "render_mode": None, "situation": item})
-        except TypeError as error:
-            raise ValueError(f"{spec.id} takes no situation; give environments or factories instead.") from error
-    made = item()
+        # The Monitor that Stable-Baselines3 puts around an environment is no part of the robot.
+        return partial(_make_situation, replace(spec, additional_wrappers=()), item)
+    return partial(_make_from_factory, item)
+
+
+def _make_situation(spec: EnvSpec, situation: Situation | Mapping[str, Any] | str) -> gym.Env[Any, Any]:
+    try:
+        return gym.make(spec, render_mode=None, situation=situation)
+    except TypeError as error:
+        raise ValueError(f"{spec.id} takes no situation; give environments or factories instead.") from error
+
+
+def _make_from_factory(factory: Callable[[], gym.Env[Any, Any]]) -> gym.Env[Any, Any]:
+    made = factory()
     if not isinstance(made, gym.Env):
         raise ValueError(f"A factory must return a Gymnasium environment, got {type(made).__name__}.")
     return made
+
+
+def _check_same_spaces(made: gym.Env[Any, Any], env: VecEnv) -> None:
+    if made.observation_space != env.observation_space or made.action_space != env.action_space:
+        raise ValueError(
+            f"Each situation must have the agent's spaces, {env.observation_space} and {env.action_space}; "
+            f"got {made.observation_space} and {made.action_space}."
+        )
 
 
 def _get(env: gym.Env[Any, Any], name: str, default: Any) -> Any:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from famle_agent.adaptation import Belief, Memory, adapt, prior
+from torch import Tensor
+
+from famle_agent.adaptation import Belief, Candidates, Memory, adapt, prior
 from famle_agent.agent import ModelBasedAgent
 from famle_agent.dashboard import log_embeddings
 from famle_agent.meta_learning import MetaStep
+from famle_agent.online import OnlineState
 from famle_agent.transitions import Transitions
 
 __all__ = ["FAMLE"]
@@ -26,24 +29,55 @@ class FAMLE(ModelBasedAgent):
         ('intact', 'joint 0 dead')
     """
 
-    def _learn_model(self, transitions: Transitions, on_iteration: Callable[[dict[str, float]], bool]) -> None:
-        """Algorithm 1: randomly initialised theta and H, and Reptile on both."""
+    def _learn_model(
+        self, transitions: Transitions, round_: int, last: bool, on_iteration: Callable[[dict[str, float]], bool]
+    ) -> None:
+        """Joint training in each round, and in the last one Algorithm 1: Reptile on theta and H."""
         settings = self.hyperparameters
         obs, action, next_obs = self._tensors(transitions.obs, transitions.action, transitions.next_obs)
-        self.dynamics = self._new_dynamics(n_situations=len(transitions.situations))
-        self.dynamics.fit_normalisation(obs, next_obs)
-        data = self.dynamics.encode(obs, action, next_obs)
+        if round_ == 0:
+            self.dynamics = self._new_dynamics(n_situations=len(transitions.situations))
+            self.dynamics.fit_normalisation(obs, next_obs)
+        model = self._require_dynamics()
+        data = model.encode(obs, action, next_obs)
 
         def log(step: MetaStep) -> bool:
             return on_iteration({"meta/loss_before": step.loss_before, "meta/loss_after": step.loss_after})
 
-        settings.reptile()(self.dynamics, data, settings.inner_loop(), self._generator, log)
-        self.dynamics.fit_noise(data)
-        log_embeddings(self.logger, self.dynamics.embeddings, self.situations, self.num_timesteps)
+        joint_training = settings.joint_training(round_)
+        finished = joint_training(model, data, self._generator, lambda loss: on_iteration({"meta/joint_loss": loss}))
+        if last and finished:
+            settings.reptile()(model, data, settings.inner_loop(), self._generator, log)
+        model.fit_noise(data)
+        if last:
+            log_embeddings(self.logger, model.embeddings[0], self.situations, self.num_timesteps)
+
+    def _candidates(self) -> Candidates:
+        return Candidates.of(self._require_dynamics(), self.hyperparameters.compose)
+
+    def posterior(self, state: OnlineState | None = None) -> dict[str, float]:
+        """P(situation | memory) by name, of the first robot; of what the agent believes now, or of a state.
+
+        Where faults are composed, ``"a + b"`` is the situation with both.
+        """
+        belief = self.belief if state is None else state.belief
+        names = self._candidates().names(self.situations)
+        return dict(zip(names, belief.posterior[0].tolist(), strict=True))
+
+    def marginals(self, state: OnlineState | None = None) -> dict[str, float]:
+        """As :meth:`posterior`, but of each training situation, be it alone or a part of what is wrong."""
+        belief = self.belief if state is None else state.belief
+        marginal = self._candidates().marginal(belief.posterior)
+        return dict(zip(self.situations, marginal[0].tolist(), strict=True))
 
     def _prior(self, robots: int) -> Belief:
-        return prior(self._require_dynamics(), robots)
+        return prior(self._require_dynamics(), self._candidates(), robots)
+
+    def _log_likelihood(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
+        model = self._require_dynamics()
+        transition = model.encode(obs[:, None], action[:, None], next_obs[:, None])
+        return self._candidates().log_likelihood(model, transition)[:, 0]
 
     def _adapt(self, memory: Memory, belief: Belief) -> Belief:
         """Algorithm 2, lines 6 and 7: the most likely embedding, then k gradient steps on theta and h."""
-        return adapt(self._require_dynamics(), memory, self.hyperparameters.adaptation(), belief)
+        return adapt(self._require_dynamics(), self._candidates(), memory, self.hyperparameters.adaptation(), belief)

@@ -7,13 +7,17 @@ import difflib
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import yaml
 
 from famle_agent.inner_loop import InnerLoop
+from famle_agent.joint_training import JointTraining
 from famle_agent.meta_learning import Reptile
 from famle_agent.planning import ICEM, MPPI, Planner, RandomShooting
+
+if TYPE_CHECKING:
+    from importlib.resources.abc import Traversable
 
 __all__ = ["Hyperparameters", "Robot", "known_robots", "robot_of"]
 
@@ -27,18 +31,31 @@ class Hyperparameters:
     Attributes:
         transitions_per_situation: n, random transitions simulated in each training situation.
         action_hold: Steps that a random action is held while data are collected; the paper's is 1.
+        rounds: How often the agent goes back to simulation, plans there in every training situation, and learns on
+            from all transitions; 0 learns from random actions alone, as the paper does.
+        round_transitions: Transitions simulated in each training situation in each such round.
         hidden: Width of each hidden layer of the dynamics model.
         embedding_dim: Size of a situation embedding h.
         gate_actions: Whether h scales the actions inside the model; the paper's network only concatenates it.
+        interaction_rank: Rank of the products of h and the inputs in the first layer; 0 is the paper's network.
+        members: Networks of the ensemble, each with its own embeddings; 1 is the paper's.
+        degrees_of_freedom: Of the Student-t likelihood that tells situations apart; 0 is a Gaussian (the paper's).
+        joint_iterations: Steps of training on all situations at once before Algorithm 1; 0 is the paper's.
+        round_iterations: The same in each later round.
+        joint_lr: Rate of theta in joint training.
+        joint_embedding_lr: Rate of H in joint training.
+        joint_batch_size: Transitions per step of joint training and member of the ensemble.
         inner_optimizer: Optimiser of the inner loop, ``"sgd"`` (the paper's) or ``"adam"``.
         inner_steps: k of meta-learning.
         inner_lr: alpha, rate of theta in the inner loop.
         embedding_lr: beta, rate of h in the inner loop.
         batch_size: Transitions per inner step of meta-learning.
-        meta_iterations: Iterations of Algorithm 1.
+        meta_iterations: Iterations of Algorithm 1; 0 leaves it at the joint training.
         meta_lr: alpha_meta.
         embedding_meta_lr: beta_meta.
         meta_batch_size: Situations per iteration of Algorithm 1; the paper's is 1.
+        compose: Whether the most likely embedding is looked for among the sums of two training situations too, which
+            stand for both faults at once; the paper has none.
         adapt_every: K, robot steps between two adaptations; 0 never adapts.
         memory_size: M, transitions that adaptation looks back on.
         adapt_steps: k of online adaptation; None takes ``inner_steps``, 0 only selects an embedding.
@@ -60,9 +77,19 @@ class Hyperparameters:
 
     transitions_per_situation: int = 2000
     action_hold: int = 1
+    rounds: int = 0
+    round_transitions: int = 1000
     hidden: tuple[int, ...] = (200, 200)
     embedding_dim: int = 5
     gate_actions: bool = True
+    interaction_rank: int = 0
+    members: int = 1
+    degrees_of_freedom: float = 0.0
+    joint_iterations: int = 0
+    round_iterations: int = 0
+    joint_lr: float = 1e-3
+    joint_embedding_lr: float = 5e-3
+    joint_batch_size: int = 512
     inner_optimizer: Literal["sgd", "adam"] = "adam"
     inner_steps: int = 20
     inner_lr: float = 1e-3
@@ -72,6 +99,7 @@ class Hyperparameters:
     meta_lr: float = 1.0
     embedding_meta_lr: float = 1.0
     meta_batch_size: int = 20
+    compose: bool = False
     adapt_every: int = 5
     memory_size: int = 50
     adapt_steps: int | None = None
@@ -125,6 +153,20 @@ class Hyperparameters:
         """The settings as JSON types."""
         return dataclasses.asdict(self) | {"hidden": list(self.hidden)}
 
+    def learnt_alike(self, other: Hyperparameters) -> bool:
+        """Whether a model that was meta-learned with these settings is what the other ones would give."""
+        names = [field.name for field in dataclasses.fields(self) if field.name not in _ONLINE]
+        return all(getattr(self, name) == getattr(other, name) for name in names)
+
+    def iterations(self, rounds: int, last: bool = True) -> int:
+        """Iterations of the learning to the end of a round, counted from 0, with Algorithm 1 if it is the last."""
+        return self.joint_iterations + rounds * self.round_iterations + last * self.meta_iterations
+
+    def joint_training(self, round_: int) -> JointTraining:
+        """What comes before Algorithm 1, in each round."""
+        iterations = self.round_iterations if round_ else self.joint_iterations
+        return JointTraining(iterations, self.joint_lr, self.joint_embedding_lr, self.joint_batch_size)
+
     def inner_loop(self) -> InnerLoop:
         """U^k of meta-learning."""
         return InnerLoop(self.inner_steps, self.inner_lr, self.embedding_lr, self.inner_optimizer)
@@ -158,13 +200,22 @@ class Hyperparameters:
         return ICEM(self.horizon, self.candidates, elites=self.elites, **shared)  # type: ignore[arg-type]
 
 
-_LEAST = {
-    **dict.fromkeys(("transitions_per_situation", "action_hold", "embedding_dim", "inner_steps", "batch_size"), 1),
-    **dict.fromkeys(("meta_iterations", "meta_batch_size", "memory_size", "horizon", "candidates"), 1),
-    **dict.fromkeys(("planner_iterations", "elites"), 1),
-    **dict.fromkeys(("inner_lr", "embedding_lr", "meta_lr", "embedding_meta_lr", "adapt_every", "adapt_steps"), 0),
-    **dict.fromkeys(("adapt_lr", "adapt_embedding_lr", "init_std", "noise_beta", "temperature"), 0),
+_ONLINE = {
+    *("compose", "adapt_every", "memory_size", "adapt_steps", "adapt_lr", "adapt_embedding_lr", "forget_at_reset"),
+    *("planner", "horizon", "candidates", "planner_iterations", "elites", "init_std", "noise_beta", "temperature"),
 }
+"""Settings of the life on a robot; rounds in simulation plan too, but a model may be used with another planner."""
+_AT_LEAST_ONE = (
+    *("transitions_per_situation", "action_hold", "round_transitions", "embedding_dim", "members"),
+    *("joint_batch_size", "inner_steps", "batch_size", "meta_batch_size", "memory_size"),
+    *("horizon", "candidates", "planner_iterations", "elites"),
+)
+_AT_LEAST_ZERO = (
+    *("rounds", "interaction_rank", "degrees_of_freedom", "joint_iterations", "round_iterations", "meta_iterations"),
+    *("joint_lr", "joint_embedding_lr", "inner_lr", "embedding_lr", "meta_lr", "embedding_meta_lr"),
+    *("adapt_every", "adapt_steps", "adapt_lr", "adapt_embedding_lr", "init_std", "noise_beta", "temperature"),
+)
+_LEAST = dict.fromkeys(_AT_LEAST_ONE, 1) | dict.fromkeys(_AT_LEAST_ZERO, 0)
 _CHOICES = {
     "inner_optimizer": ("sgd", "adam"),
     "planner": ("icem", "mppi", "random_shooting"),
@@ -176,12 +227,20 @@ class Robot:
     """An entry of ``hyperparams/``: a robot, its environment and its settings in both modes.
 
     Attributes:
+        name: Its short name.
         env_id: The Gymnasium id; empty for the settings of an unknown environment.
         modes: Settings by mode: ``paper`` is the paper's text, ``ours`` what we found to be best.
     """
 
+    name: str
     env_id: str
     modes: dict[str, dict[str, Any]]
+
+    @property
+    def pretrained(self) -> Traversable | None:
+        """The file of the agent that the package ships for this robot, if it ships one."""
+        file = files("famle_agent").joinpath("pretrained", f"{self.name}.zip")
+        return file if file.is_file() else None
 
     def hyperparameters(self, mode: str, **overrides: Any) -> Hyperparameters:
         """The settings of a mode with some changed.
@@ -202,7 +261,8 @@ def known_robots() -> dict[str, Robot]:
     for file in sorted(files("famle_agent").joinpath("hyperparams").iterdir(), key=lambda file: file.name):
         if file.name.endswith(".yaml"):
             entry = yaml.safe_load(file.read_text())
-            robots[file.name.removesuffix(".yaml")] = Robot(entry.pop("env_id"), entry)
+            name = file.name.removesuffix(".yaml")
+            robots[name] = Robot(name, entry.pop("env_id"), entry)
     return robots
 
 

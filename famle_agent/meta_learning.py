@@ -81,24 +81,25 @@ class Reptile:
             # Sample situations c and start from theta and h_c (line 10).
             order = torch.randperm(n_situations, generator=generator, device=generator.device)
             c = order[:meta_batch_size].to(data.x.device)
-            theta, h = model.parameters_by_name(), model.embeddings[c]
+            theta, h = model.parameters_by_name(), model.embeddings_of(c)
 
             # theta~, h~ = U^k(theta, h_c) (line 11).
-            sample = partial(self._sample, data, c, generator)
+            sample = partial(self._sample, data, c.repeat_interleave(model.members), generator)
             theta_tilde, h_tilde, losses = inner_loop(model, expand(theta, meta_batch_size), h, sample)
 
             # Move theta towards the mean of theta~ and each h_c towards its h~ (lines 12 and 13).
-            decay = 1.0 - iteration / self.iterations
+            decay, members = 1.0 - iteration / self.iterations, model.members
             for name, value in model.theta.items():
-                value.lerp_(theta_tilde[name].mean(dim=0), decay * self.meta_lr)
-            model.embeddings[c] = h.lerp(h_tilde, decay * self.embedding_meta_lr)
+                value.lerp_(theta_tilde[name].view(-1, *value.shape).mean(dim=0), decay * self.meta_lr)
+            h = h.lerp(h_tilde, decay * self.embedding_meta_lr)
+            model.embeddings[:, c] = h.view(-1, members, h.shape[1]).transpose(0, 1)
 
             step = MetaStep(iteration + 1, c, losses[0].mean().item(), losses[-1].mean().item())
             if not callback(step):
                 return
 
     def _sample(self, data: Batch, c: Tensor, generator: torch.Generator) -> Batch:
-        """A minibatch of each situation in ``c``."""
+        """A minibatch of each situation in ``c``, with repetitions."""
         shape = (len(c), self.batch_size)
         i = torch.randint(data.x.shape[1], shape, generator=generator, device=generator.device).to(data.x.device)
         return Batch(data.x[c[:, None], i], data.y[c[:, None], i], data.weight[c[:, None], i])

@@ -47,7 +47,7 @@ class OnlineState:
         """All but :attr:`last` and the counts, for a checkpoint."""
         tensors = {f"theta.{name}": value for name, value in self.belief.theta.items()}
         tensors |= {f"memory.{name}": value for name, value in vars(self.memory).items()}
-        return tensors | {"h": self.belief.h, "log_likelihood": self.belief.log_likelihood, "plan": self.plan}
+        return tensors | {"h": self.belief.h, "log_posterior": self.belief.log_posterior, "plan": self.plan}
 
     @classmethod
     def from_tensors(cls, tensors: dict[str, Tensor], steps: int, adaptations: int) -> OnlineState:
@@ -56,7 +56,7 @@ class OnlineState:
         def part(prefix: str) -> dict[str, Tensor]:
             return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
-        belief = Belief(part("theta."), tensors["h"], tensors["log_likelihood"], adaptations)
+        belief = Belief(part("theta."), tensors["h"], tensors["log_posterior"], adaptations)
         return cls(Memory(**part("memory.")), belief, tensors["plan"], steps=steps)
 
 
@@ -66,19 +66,23 @@ class OnlineLoop:
 
     Attributes:
         prior: What B robots believe before they have seen anything.
+        log_likelihood: Log-likelihood of a transition of each robot under each candidate, (B, C).
         adapt: The belief after the transitions in the memory (lines 6 and 7).
         simulator: The model that a belief stands for.
         reward_fn: r(s, a, s') with actions in [-1, 1].
         planner: MPC (line 8).
+        members: P, the models of the simulator for each robot; a plan is judged by their mean.
         adapt_every: K; 0 never adapts.
         forget_at_reset: Whether a new episode empties a robot's memory.
     """
 
     prior: Callable[[int], Belief]
+    log_likelihood: Callable[[Tensor, Tensor, Tensor], Tensor]
     adapt: Callable[[Memory, Belief], Belief]
     simulator: Callable[[Belief], Model]
     reward_fn: RewardFn
     planner: Planner
+    members: int
     adapt_every: int
     forget_at_reset: bool
 
@@ -98,7 +102,7 @@ class OnlineLoop:
         """
         if state.last is None:
             return state
-        memory = state.memory.add(*state.last, obs, valid=~starts)
+        memory = state.memory.add(*state.last, obs, self.log_likelihood(*state.last, obs), valid=~starts)
         if starts.all():
             return replace(state, last=None)
         state = replace(state, memory=memory, last=None, steps=state.steps + 1)
@@ -114,7 +118,7 @@ class OnlineLoop:
         state = self.reset(state, starts)
         simulator = self.simulator(state.belief)
         action, plan = self.planner.plan(
-            lambda tau: imagine(simulator, self.reward_fn, obs, tau), state.plan, generator
+            lambda tau: imagine(simulator, self.reward_fn, obs, tau, self.members), state.plan, generator
         )
         return action, replace(state, plan=shift(plan), last=(obs, action))
 

@@ -28,21 +28,27 @@ RewardFn = Callable[[Tensor, Tensor, Tensor], Tensor]
 """r(s, a, s'): (..., obs_dim), (..., action_dim), (..., obs_dim) -> (...)."""
 
 
-def imagine(model: Model, reward_fn: RewardFn, obs: Tensor, actions: Tensor) -> Tensor:
-    """Sums the rewards of candidate sequences (the paper's eq. 13).
+def imagine(model: Model, reward_fn: RewardFn, obs: Tensor, actions: Tensor, members: int = 1) -> Tensor:
+    """Sums the rewards of candidate sequences (the paper's eq. 13), a mean over the members of an ensemble.
+
+    A planner finds what a single model is wrong about; that several are wrong in the same way is rarer.
 
     Args:
-        model: The dynamics.
+        model: The dynamics of B robots in P models each, (B * P, ...).
         reward_fn: The reward of a transition.
         obs: Where the robots are, (B, obs_dim).
         actions: Candidates in [-1, 1], (B, N, H, action_dim).
+        members: P.
 
     Returns:
-        The return of each candidate, (B, N); -inf where the model left the finite numbers.
+        The return of each candidate, (B, N); -inf where a model left the finite numbers.
     """
+    obs, actions = (values.repeat_interleave(members, dim=0) for values in (obs, actions))
     # A few thousand candidates at a time stay in the processor's cache over the whole horizon.
-    returns = [_imagine(model, reward_fn, obs, part) for part in torch.split(actions, _CANDIDATES_AT_ONCE, dim=1)]
-    return torch.nan_to_num(torch.cat(returns, dim=1), nan=-math.inf, posinf=-math.inf, neginf=-math.inf)
+    parts = torch.split(actions, max(1, _CANDIDATES_AT_ONCE // len(actions)), dim=1)
+    returns = torch.cat([_imagine(model, reward_fn, obs, part) for part in parts], dim=1)
+    returns = torch.nan_to_num(returns, nan=-math.inf, posinf=-math.inf, neginf=-math.inf)
+    return returns.view(-1, members, returns.shape[1]).mean(dim=1)
 
 
 def _imagine(model: Model, reward_fn: RewardFn, obs: Tensor, actions: Tensor) -> Tensor:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,9 +29,14 @@ from famle_agent.envs import EnvLike, check_spaces, env_attribute, env_spec, mak
 from famle_agent.errors import NotLearnedError
 from famle_agent.hyperparameters import Hyperparameters, robot_of
 from famle_agent.planning import RewardFn
+from famle_agent.policies import MakePolicy, make_held_uniform, make_planning
 from famle_agent.reward import LearnedReward
-from famle_agent.transitions import HeldUniformPolicy, Transitions, collect
+from famle_agent.run_folder import RunFolder
+from famle_agent.transitions import EnvSource, Transitions, collect
 from famle_agent.units import ActionScale
+
+if TYPE_CHECKING:
+    from importlib.resources.abc import Traversable
 
 __all__ = ["SimulationLearner"]
 
@@ -46,14 +54,18 @@ class SimulationLearner(BaseAlgorithm):
         reward_fn: r(s, a, s') for torch tensors (..., dim) -> (...). None takes the environment's
             ``reward_fn``, and where it has none the reward is learnt with the dynamics.
         angle_dims: Observation dimensions that are angles in rad. None takes the environment's ``angle_dims``.
+        quaternion_dims: The four observation dimensions of a unit quaternion, or none of them. None takes the
+            environment's ``quaternion_dims``.
         tensorboard_log: Folder for TensorBoard; None logs nothing there.
         verbose: 0 for silence, 1 for information, 2 for debugging.
         device: ``"auto"``, ``"cpu"`` or ``"cuda"``.
         seed: Seed of everything; the same seed gives the same agent.
+        pretrained: Whether to begin with the meta-learned model that the package ships, where it ships one for this
+            environment and these settings (``"ant"``). :meth:`meta_learn` learns anew all the same.
         **overrides: Settings to change, see :class:`~famle_agent.hyperparameters.Hyperparameters`.
 
     Attributes:
-        dynamics: The meta-learned model; None before :meth:`meta_learn`.
+        dynamics: The meta-learned model; None before :meth:`meta_learn`, where none is shipped.
         situations: What the training situations are called, in the order of the model's embeddings.
 
     Raises:
@@ -73,10 +85,12 @@ class SimulationLearner(BaseAlgorithm):
         *,
         reward_fn: RewardFn | None = None,
         angle_dims: Sequence[int] | None = None,
+        quaternion_dims: Sequence[int] | None = None,
         tensorboard_log: str | None = None,
         verbose: int = 0,
         device: torch.device | str = "auto",
         seed: int | None = None,
+        pretrained: bool = True,
         **overrides: Any,
     ) -> None:
         if env is not None:
@@ -105,10 +119,14 @@ class SimulationLearner(BaseAlgorithm):
         if angle_dims is None:
             angle_dims = () if self.env is None else env_attribute(self.env, "angle_dims", ())
         self._angle_dims = tuple(angle_dims)
-        if self.env is not None and any(not 0 <= dim < self.observation_space.shape[0] for dim in self._angle_dims):
-            raise ValueError(f"angle_dims {self._angle_dims} name dimensions that {self.observation_space} has not.")
+        if quaternion_dims is None:
+            quaternion_dims = () if self.env is None else env_attribute(self.env, "quaternion_dims", ())
+        self._quaternion_dims = tuple(quaternion_dims)
+        self._check_dims()
         self._generator = torch.Generator(self.device)
         self._setup_model()
+        if pretrained and robot.pretrained is not None:
+            self._load_pretrained(robot.pretrained)
 
     def _setup_model(self) -> None:
         self.dynamics = None
@@ -141,16 +159,39 @@ class SimulationLearner(BaseAlgorithm):
         self._env_spec = env_spec(env)
         self._env_reward_fn = env_attribute(env, "reward_fn", None)
 
+    def _check_dims(self) -> None:
+        if len(self._quaternion_dims) not in (0, 4):
+            raise ValueError(f"quaternion_dims must name four dimensions or none, got {self._quaternion_dims}.")
+        dims = [*self._angle_dims, *self._quaternion_dims]
+        if len(set(dims)) < len(dims):
+            raise ValueError(f"angle_dims and quaternion_dims name a dimension twice: {dims}.")
+        if self.env is not None and any(not 0 <= dim < self.observation_space.shape[0] for dim in dims):
+            raise ValueError(
+                f"angle_dims {self._angle_dims} and quaternion_dims {self._quaternion_dims} name dimensions that "
+                f"{self.observation_space} has not."
+            )
+
     @abstractmethod
-    def _learn_model(self, transitions: Transitions, on_iteration: Callable[[dict[str, float]], bool]) -> None:
+    def _learn_model(
+        self, transitions: Transitions, round_: int, last: bool, on_iteration: Callable[[dict[str, float]], bool]
+    ) -> None:
         """Learns :attr:`dynamics` from simulated transitions (actions in [-1, 1]).
 
-        ``on_iteration`` takes scalars to log and says whether to go on.
+        Round 0 begins with a new model, the others go on with :attr:`dynamics`. ``on_iteration`` takes scalars to log
+        and says whether to go on.
         """
 
     @abstractmethod
     def forget(self) -> None:
         """Returns to what was meta-learned, as for a robot that was just repaired."""
+
+    @abstractmethod
+    def _load_pretrained(self, file: Traversable) -> None:
+        """Takes over the model of a shipped agent, if it was learnt for this environment with these settings."""
+
+    @abstractmethod
+    def _restore(self, file: Path) -> None:
+        """Takes over the model of a stored agent, and where its random numbers had got to."""
 
     def meta_learn(
         self,
@@ -158,75 +199,131 @@ class SimulationLearner(BaseAlgorithm):
         callback: MaybeCallback = None,
         tb_log_name: str | None = None,
         progress_bar: bool = False,
+        n_jobs: int = 1,
+        folder: str | os.PathLike[str] | None = None,
     ) -> Self:
         """Learns in simulation: collects transitions in every situation, then learns the model from them.
 
-        While it runs, ``num_timesteps`` counts the iterations of the meta-learning, and callbacks are called once
-        an iteration.
+        With ``rounds`` in the settings it goes round: the agent plans with its model in every simulated situation, and
+        learns on from all transitions. While the model learns, ``num_timesteps`` counts the iterations, and callbacks
+        are called once an iteration.
 
         Args:
             envs: One environment, factory or :class:`~famle_envs.Situation` per situation; None takes the training
-                situations that the agent's environment names. Or :class:`Transitions` that were collected before.
+                situations that the agent's environment names. Or :class:`Transitions` that were collected before, which
+                are then all that is learnt from.
                 List the situation first that the robot is in until it shows otherwise.
             callback: Stable-Baselines3 callbacks, or a function.
             tb_log_name: Name of the run in TensorBoard; by default the class and ``_meta``.
             progress_bar: Whether to show progress bars.
+            n_jobs: Processes that simulate, -1 for one a core. The result does not depend on it.
+            folder: Where transitions are stored as they come, and the model after each round. The same call goes on
+                where one that was stopped had got to.
 
         Returns:
             The agent.
 
         Raises:
-            ValueError: There are no situations, or an environment's spaces differ from the agent's.
+            ValueError: There are no situations, an environment's spaces differ from the agent's, or the folder is of a
+                run with other settings.
         """
-        transitions = self.collect(envs, progress_bar) if not isinstance(envs, Transitions) else envs
-        transitions = self._in_model_units(transitions)
+        given = envs if isinstance(envs, Transitions) else None
+        sources = None if isinstance(envs, Transitions) else situation_envs(self._require_env(), envs)
+        rounds = 0 if given is not None else self.hyperparameters.rounds
+        run = None if folder is None else RunFolder(folder, self._fingerprint(sources))
         if not self._custom_logger:
             name = tb_log_name or f"{type(self).__name__}_meta"
             self._logger = configure_logger(self.verbose, self.tensorboard_log, name)
         hooks = self._init_callback(callback)
-        total_timesteps = self.hyperparameters.meta_iterations  # the name that callbacks look for
-        self.situations, self.num_timesteps = transitions.situations, 0
+        total_timesteps = self.hyperparameters.iterations(rounds)  # the name that callbacks look for
+        self.num_timesteps = 0
         self.forget()
-        with tqdm(total=total_timesteps, desc="Meta-learning", mininterval=1.0, disable=not progress_bar) as bar:
-
-            def on_iteration(scalars: dict[str, float]) -> bool:
-                bar.set_postfix({key.split("/")[-1]: f"{value:.3g}" for key, value in scalars.items()}, refresh=False)
-                bar.update()
-                return self._log_iteration(scalars, hooks)
-
-            hooks.on_training_start(locals(), globals())
-            with torch.random.fork_rng(devices=[]):
-                torch.manual_seed(self._draw_seed())  # initial weights come from torch's global generator
-                self._learn_model(transitions, on_iteration)
-                self._learn_reward(transitions)
+        hooks.on_training_start(locals(), globals())
+        transitions, going_on = None, True
+        for round_ in range(rounds + 1):
+            store = None if run is None else run.transitions(round_)
+            new = given or self._collect(sources, round_, progress_bar, n_jobs, store)
+            new = self._in_model_units(new)
+            transitions = new if transitions is None else transitions.followed_by(new)
+            self.situations = transitions.situations
+            if run is not None and run.has_model(round_):
+                self._restore(run.model(round_))
+                self.num_timesteps = self.hyperparameters.iterations(round_, last=round_ == rounds)
+                continue
+            going_on = self._learn_round(transitions, round_, rounds, hooks, progress_bar)
+            if not going_on:
+                break
+            if run is not None:
+                self.save(run.model(round_))
         hooks.on_training_end()
         self.num_timesteps = 0
         return self
 
-    def collect(self, envs: Sequence[EnvLike] | None = None, progress_bar: bool = False) -> Transitions:
+    def _learn_round(
+        self, transitions: Transitions, round_: int, rounds: int, hooks: BaseCallback, progress_bar: bool
+    ) -> bool:
+        """Learns the model, and the reward where it is not known; says whether no callback ended it."""
+        settings, last, going_on = self.hyperparameters, round_ == rounds, True
+        total, before = settings.iterations(round_, last), self.num_timesteps
+        name = "Meta-learning" + (f" {round_ + 1}/{rounds + 1}" if rounds else "")
+        with tqdm(total=total - before, desc=name, mininterval=1.0, disable=not progress_bar) as bar:
+
+            def on_iteration(scalars: dict[str, float]) -> bool:
+                nonlocal going_on
+                bar.set_postfix({key.split("/")[-1]: f"{value:.3g}" for key, value in scalars.items()}, refresh=False)
+                bar.update()
+                going_on = self._log_iteration(scalars, max(1, settings.iterations(rounds) // 200), hooks)
+                return going_on
+
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(self._draw_seed())  # initial weights come from torch's global generator
+                self._learn_model(transitions, round_, last, on_iteration)
+                self._learn_reward(transitions)
+        return going_on
+
+    def collect(
+        self, envs: Sequence[EnvLike] | None = None, progress_bar: bool = False, n_jobs: int = 1
+    ) -> Transitions:
         """Collects the random transitions that :meth:`meta_learn` learns from; arguments as there."""
-        made, labels, ours = situation_envs(self._require_env(), envs)
-        n, hold = self.hyperparameters.transitions_per_situation, self.hyperparameters.action_hold
-        try:
-            for env in made:
-                if env.observation_space != self.observation_space or env.action_space != self.action_space:
-                    raise ValueError(
-                        f"Each situation must have the agent's spaces, {self.observation_space} and "
-                        f"{self.action_space}; got {env.observation_space} and {env.action_space}."
-                    )
-            with tqdm(total=n * len(made), desc="Simulating", unit="step", disable=not progress_bar) as bar:
-                return collect(
-                    made,
-                    labels,
-                    n,
-                    lambda space, rng: HeldUniformPolicy(space, hold, rng),
-                    self._draw_seed(),
-                    bar.update,
-                )
-        finally:
-            for env, close in zip(made, ours, strict=True):
-                if close:
-                    env.close()
+        return self._collect(situation_envs(self._require_env(), envs), 0, progress_bar, n_jobs, None)
+
+    def _collect(
+        self,
+        sources: tuple[list[EnvSource], list[str]] | None,
+        round_: int,
+        progress_bar: bool,
+        n_jobs: int,
+        folder: Path | None,
+    ) -> Transitions:
+        """Random transitions in round 0, the agent's own planning after that."""
+        if sources is None:
+            raise ValueError("There are no environments to collect from.")
+        settings, (envs, labels) = self.hyperparameters, sources
+        make_policy: MakePolicy
+        if round_ == 0:
+            n, make_policy = settings.transitions_per_situation, make_held_uniform(settings.action_hold)
+        else:
+            n, make_policy = settings.round_transitions, self._planning()
+        name = f"Simulating {round_ + 1}/{settings.rounds + 1}" if settings.rounds else "Simulating"
+        with tqdm(total=n * len(envs), desc=name, unit="step", disable=not progress_bar) as bar:
+            return collect(envs, labels, n, make_policy, self._draw_seed(), bar.update, n_jobs, folder)
+
+    def _planning(self) -> MakePolicy:
+        """What makes the agent plan with what it has learnt so far."""
+        model, reward_fn = deepcopy(self._require_dynamics()).cpu(), self._reward_fn
+        if reward_fn is None and self._learned_reward is not None:
+            reward_fn = deepcopy(self._learned_reward).cpu()
+        return make_planning(model, self.hyperparameters.make_planner(), reward_fn)
+
+    def _fingerprint(self, sources: tuple[list[EnvSource], list[str]] | None) -> dict[str, Any]:
+        """What two runs must have in common for one to go on where the other stopped."""
+        return {
+            "agent": type(self).__name__,
+            "env": self._env_spec,
+            "seed": self.seed,
+            "situations": None if sources is None else sources[1],
+            "hyperparameters": self.hyperparameters.to_dict(),
+        }
 
     def _in_model_units(self, transitions: Transitions) -> Transitions:
         """The same with actions in [-1, 1]."""
@@ -247,11 +344,11 @@ class SimulationLearner(BaseAlgorithm):
             obs, action, next_obs = self._tensors(transitions.obs, transitions.action, transitions.next_obs)
             self._learned_reward.fit(obs, action, next_obs, self._tensor(transitions.reward), self._generator)
 
-    def _log_iteration(self, scalars: dict[str, float], hooks: BaseCallback) -> bool:
+    def _log_iteration(self, scalars: dict[str, float], interval: int, hooks: BaseCallback) -> bool:
         self.num_timesteps += 1
         for key, value in scalars.items():
             self.logger.record(key, value)
-        if self.num_timesteps % max(1, self.hyperparameters.meta_iterations // 100) == 0:
+        if self.num_timesteps % interval == 0:
             self.logger.dump(self.num_timesteps)
         hooks.update_locals(locals())
         return hooks.on_step()
@@ -265,7 +362,11 @@ class SimulationLearner(BaseAlgorithm):
             settings.embedding_dim,
             settings.hidden,
             self._angle_dims,
+            self._quaternion_dims,
             settings.gate_actions,
+            settings.interaction_rank,
+            settings.members,
+            settings.degrees_of_freedom,
         ).to(self.device)
 
     def _new_reward(self) -> LearnedReward:

@@ -8,42 +8,21 @@ import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
+import torch
+from joblib import Parallel, delayed
 
-__all__ = ["HeldUniformPolicy", "Policy", "Transitions", "collect"]
+from famle_agent.policies import MakePolicy
+
+__all__ = ["EnvSource", "Transitions", "collect"]
 
 Array = npt.NDArray[np.float32]
-
-
-class Policy(Protocol):
-    """What chooses the actions while data are collected."""
-
-    def __call__(self, obs: npt.NDArray[Any], episode_start: bool) -> npt.NDArray[Any]:
-        """The action for an observation, in the environment's action space."""
-
-
-class HeldUniformPolicy:
-    """Uniformly random actions, each held for some steps.
-
-    ``hold=1`` are the paper's independent actions. Held ones carry a robot further from its start for the
-    same number of steps.
-    """
-
-    def __init__(self, action_space: gym.spaces.Box, hold: int, rng: np.random.Generator) -> None:
-        self._space, self._hold, self._rng = action_space, hold, rng
-        self._age = 0
-        self._action: npt.NDArray[Any] | None = None
-
-    def __call__(self, obs: npt.NDArray[Any], episode_start: bool) -> npt.NDArray[Any]:
-        """The held action, or a new one when its time is over or an episode begins."""
-        if episode_start or self._action is None or self._age >= self._hold:
-            self._action, self._age = self._rng.uniform(self._space.low, self._space.high), 0
-        self._age += 1
-        return self._action.astype(self._space.dtype)
+EnvSource = gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]]
+"""An environment, used where it is and left open; or what makes one, in whatever process, to be closed after use."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +58,18 @@ class Transitions:
                 raise ValueError(f"{name} holds values that are not finite; collect the transitions again.")
         if self.obs.shape != self.next_obs.shape:
             raise ValueError(f"obs {self.obs.shape} and next_obs {self.next_obs.shape} must have the same shape.")
+
+    def followed_by(self, others: Transitions) -> Transitions:
+        """More transitions of the same situations, behind these.
+
+        Raises:
+            ValueError: The situations differ.
+        """
+        if self.situations != others.situations:
+            raise ValueError(f"Transitions of {others.situations} cannot follow those of {self.situations}.")
+        names = ("obs", "action", "reward", "next_obs")
+        arrays = {name: np.concatenate([getattr(self, name), getattr(others, name)], axis=1) for name in names}
+        return Transitions(**arrays, situations=self.situations)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a compressed NumPy archive; an older file stays whole until the new one is complete."""
@@ -118,42 +109,99 @@ class Transitions:
 
 
 def collect(
-    envs: Sequence[gym.Env[Any, Any]],
+    envs: Sequence[EnvSource],
     situations: Sequence[str],
     n: int,
-    make_policy: Callable[[gym.spaces.Box, np.random.Generator], Policy],
+    make_policy: MakePolicy,
     seed: int,
     callback: Callable[[int], object] = lambda _: None,
+    n_jobs: int = 1,
+    folder: Path | None = None,
 ) -> Transitions:
     """Runs a policy in the environment of each situation (lines 1 to 6 of Algorithm 1).
 
     Args:
-        envs: One environment per situation.
+        envs: One environment, or what makes it, per situation.
         situations: What each is called.
         n: Transitions per situation.
-        make_policy: Makes the policy of a situation from its action space and a generator.
-        seed: Seed of the environments and the policies.
+        make_policy: Makes the policy of a situation.
+        seed: Seed of the environments and the policies. What is collected does not depend on ``n_jobs``.
         callback: Called with the number of new transitions after each situation.
+        n_jobs: Parallel processes, -1 for one a core; environments that exist already stay in this one.
+        folder: Where each situation's transitions are stored as soon as they are there. What it holds of an earlier
+            run that was stopped is not collected again.
 
     Returns:
         The transitions; the step that a reset interrupts is no transition and is not among them.
+
+    Raises:
+        ValueError: The folder holds transitions of other situations, or of another number.
     """
-    parts = []
-    for env, sequence in zip(envs, np.random.SeedSequence(seed).spawn(len(envs)), strict=True):
-        policy = make_policy(env.action_space, np.random.default_rng(sequence))  # type: ignore[arg-type]
-        parts.append(_collect_one(env, n, policy, sequence))
-        callback(n)
-    obs, action, reward, next_obs = (np.stack(values) for values in zip(*parts, strict=True))
-    return Transitions(obs, action, reward, next_obs, tuple(situations))
+    sequences = np.random.SeedSequence(seed).spawn(len(envs))
+    tasks = [
+        _Task(i, env, situations[i], n, make_policy, sequence, folder)
+        for i, (env, sequence) in enumerate(zip(envs, sequences, strict=True))
+    ]
+    parts: dict[int, Transitions] = {}
+    for here in (True, False):
+        some = [task for task in tasks if isinstance(task.env, gym.Env) == here]
+        calls = (delayed(_in_process if n_jobs != 1 and not here else _Task.run)(task) for task in some)
+        workers = Parallel(n_jobs=1 if here else n_jobs, return_as="generator_unordered")
+        for i, part in workers(calls):
+            parts[i] = part
+            callback(n)
+    arrays = {
+        name: np.concatenate([getattr(parts[i], name) for i in range(len(envs))])
+        for name in ("obs", "action", "reward", "next_obs")
+    }
+    return Transitions(**arrays, situations=tuple(situations))
 
 
-def _collect_one(
-    env: gym.Env[Any, Any], n: int, policy: Policy, sequence: np.random.SeedSequence
-) -> tuple[Array, Array, Array, Array]:
+@dataclass(frozen=True)
+class _Task:
+    """The transitions of one situation, to be collected or to be read where that was done before."""
+
+    index: int
+    env: EnvSource
+    situation: str
+    n: int
+    make_policy: MakePolicy
+    sequence: np.random.SeedSequence
+    folder: Path | None
+
+    def run(self) -> tuple[int, Transitions]:
+        path = None if self.folder is None else self.folder / f"situation-{self.index:03d}.npz"
+        if path is not None and path.exists():
+            stored = Transitions.load(path)
+            if stored.situations != (self.situation,) or stored.obs.shape[:2] != (1, self.n):
+                raise ValueError(
+                    f"{path} holds {stored.obs.shape[1]} transitions of {stored.situations[0]!r} instead of {self.n} "
+                    f"of {self.situation!r}: it is of another run. Give another folder, or delete this one."
+                )
+            return self.index, stored
+        env = self.env if isinstance(self.env, gym.Env) else self.env()
+        try:
+            part = _run_policy(env, self)
+        finally:
+            if env is not self.env:
+                env.close()
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part.save(path)
+        return self.index, part
+
+
+def _in_process(task: _Task) -> tuple[int, Transitions]:
+    torch.set_num_threads(1)  # the parallel processes share the cores
+    return task.run()
+
+
+def _run_policy(env: gym.Env[Any, Any], task: _Task) -> Transitions:
+    policy = task.make_policy(env, task.index, np.random.default_rng(task.sequence))
     rows: list[tuple[Any, Any, Any, Any]] = []
-    obs = np.array(env.reset(seed=int(sequence.generate_state(1)[0]))[0])
+    obs = np.array(env.reset(seed=int(task.sequence.generate_state(1)[0]))[0])
     episode_start = True
-    while len(rows) < n:
+    while len(rows) < task.n:
         action = policy(obs, episode_start)
         next_obs, reward, terminated, truncated, _ = env.step(action)
         next_obs = np.array(next_obs)  # a copy: an environment may fill the same array again
@@ -161,5 +209,6 @@ def _collect_one(
         obs, episode_start = next_obs, terminated or truncated
         if episode_start:
             obs = np.array(env.reset()[0])
-    obs_, action_, reward_, next_obs_ = (np.array(column, dtype=np.float32) for column in zip(*rows, strict=True))
-    return obs_, action_, reward_, next_obs_
+    columns = [np.array(column, dtype=np.float32)[None] for column in zip(*rows, strict=True)]
+    obs_, action_, reward_, next_obs_ = columns
+    return Transitions(obs_, action_, reward_, next_obs_, (task.situation,))

@@ -1,6 +1,6 @@
 """Simulated robots that can break: Gymnasium environments with a ``situation``.
 
-Importing the package registers ``FamleReacher-v0``.
+Importing the package registers ``FamleReacher-v0`` and ``FamleAnt-v0``.
 """
 
 import gymnasium as gym
@@ -14,4 +14,10 @@ gym.register(
     entry_point="famle_envs.reacher:ReacherEnv",
     max_episode_steps=50,
     reward_threshold=30.0,
+)
+gym.register(
+    id="FamleAnt-v0",
+    entry_point="famle_envs.ant:AntEnv",
+    max_episode_steps=1000,
+    reward_threshold=800.0,
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from contextlib import suppress
@@ -49,13 +50,17 @@ class BulletEnv(gym.Env[Array, Array]):
     supported_faults: ClassVar[frozenset[str]]
     """The fields of a :class:`Situation` that this robot can have."""
     time_step: ClassVar[float]
-    """Duration of one physics step, in s."""
+    """Simulated time of one call of the simulator, in s."""
     physics_steps: ClassVar[int]
-    """Physics steps per control step."""
+    """Calls of the simulator per control step."""
+    substeps: ClassVar[int] = 1
+    """Physics steps into which the simulator divides a call; torques act on all of them."""
     solver_iterations: ClassVar[int] = 200
     """Of PyBullet's constraint solver; with its own 50, motors of a chain of links disturb each other."""
     angle_dims: ClassVar[tuple[int, ...]] = ()
     """Observation dimensions that are angles in [-pi, pi], where pi and -pi are the same place."""
+    quaternion_dims: ClassVar[tuple[int, ...]] = ()
+    """The four observation dimensions of a unit quaternion, where q and -q are the same orientation."""
     training_situations: ClassVar[tuple[Situation, ...]]
     """The situations of the paper's meta-training."""
     presets: ClassVar[Mapping[str, Situation]]
@@ -110,10 +115,16 @@ class BulletEnv(gym.Env[Array, Array]):
     def _observe(self) -> Array:
         """The observation as the sensors give it, faults included, as float32."""
 
-    @staticmethod
     @abstractmethod
-    def _camera() -> dict[str, Any]:
+    def _camera(self) -> dict[str, Any]:
         """Arguments of PyBullet's ``computeViewMatrixFromYawPitchRoll`` but for the up axis."""
+
+    def _perturb_start(self) -> None:
+        """Makes a start differ from the others, drawing on ``np_random``; by default all are alike."""
+
+    def _has_ended(self, obs: Array) -> bool:
+        """Whether the episode ends in the state behind this observation; by default none does."""
+        return False
 
     @abstractmethod
     def reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
@@ -138,6 +149,7 @@ class BulletEnv(gym.Env[Array, Array]):
         if "situation" in options:
             self._situation = self._resolve(options["situation"])
         pybullet.restoreState(self._start, physicsClientId=self._world)
+        self._perturb_start()
         self._apply_situation()
         self._obs = self._observe()
         return self._obs.copy(), self._info()
@@ -152,15 +164,15 @@ class BulletEnv(gym.Env[Array, Array]):
         if self._obs is None:
             raise gym.error.ResetNeeded("Call reset() before step().")
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != self.action_space.shape or not np.isfinite(action).all():
+        if action.shape != self.action_space.shape or not math.isfinite(action.sum()):
             raise ValueError(f"The action must be {self.action_space.shape} finite numbers, got {action}.")
-        self._actuate(np.clip(action, self.action_space.low, self.action_space.high))
+        self._actuate(np.minimum(np.maximum(action, self.action_space.low), self.action_space.high))
         self._hold_locked_joints()
         for _ in range(self.physics_steps):
             pybullet.stepSimulation(physicsClientId=self._client)
         previous, self._obs = self._obs, self._observe()
         reward = float(self.reward_fn(previous, action, self._obs))
-        return self._obs.copy(), reward, False, False, self._info()
+        return self._obs.copy(), reward, self._has_ended(self._obs), False, self._info()
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """A picture of the robot, (480, 480, 3); None without a render mode."""
@@ -210,6 +222,7 @@ class BulletEnv(gym.Env[Array, Array]):
         # Sleeping and unordered contact pairs would make a run depend on the runs before it.
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=self.time_step,
+            numSubSteps=self.substeps if self.substeps > 1 else 0,
             numSolverIterations=self.solver_iterations,
             deterministicOverlappingPairs=1,
             physicsClientId=client,
@@ -237,6 +250,7 @@ class BulletEnv(gym.Env[Array, Array]):
     def _apply_situation(self) -> None:
         states = pybullet.getJointStates(self._robot, self.joints, physicsClientId=self._world)
         self._locked_at = {self.joints[joint]: states[joint][0] for joint in self._situation.locked_joints}
+        self._label = self._situation.label
         if self.render_mode is not None:
             self._colour_faulty_joints()
 
@@ -260,4 +274,4 @@ class BulletEnv(gym.Env[Array, Array]):
 
     def _info(self) -> dict[str, Any]:
         # A string: Gymnasium wants nothing in `info` to be shared between two steps.
-        return {"situation": self._situation.label}
+        return {"situation": self._label}

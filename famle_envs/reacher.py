@@ -179,6 +179,5 @@ class ReacherEnv(BulletEnv):
         wrapped = (angles + math.pi) % (2 * math.pi) - math.pi
         return np.concatenate([wrapped, velocities, tip[:2]]).astype(np.float32)
 
-    @staticmethod
-    def _camera() -> dict[str, Any]:
+    def _camera(self) -> dict[str, Any]:
         return {"cameraTargetPosition": (0.0, 0.0, 0.0), "distance": 3.0, "yaw": 0, "pitch": -89.9, "roll": 0}

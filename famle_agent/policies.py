@@ -1,0 +1,129 @@
+"""What chooses the actions while transitions are simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from famle_agent.dynamics import Dynamics
+from famle_agent.planning import Model, Planner, RewardFn, imagine, shift
+from famle_agent.units import ActionScale
+
+__all__ = ["HeldUniformPolicy", "MakePolicy", "PlanningPolicy", "make_held_uniform", "make_planning"]
+
+Array = npt.NDArray[Any]
+
+
+class Policy(Protocol):
+    """Chooses actions."""
+
+    def __call__(self, obs: Array, episode_start: bool) -> Array:
+        """The action for an observation, in the environment's action space."""
+
+
+MakePolicy = Callable[[gym.Env[Any, Any], int, np.random.Generator], Policy]
+"""A policy for an environment and the index of its situation; picklable where data are collected in processes."""
+
+
+class HeldUniformPolicy:
+    """Uniformly random actions, each held for some steps.
+
+    ``hold=1`` are the paper's independent actions. Held ones carry a robot further from its start for the
+    same number of steps.
+    """
+
+    def __init__(self, action_space: gym.spaces.Box, hold: int, rng: np.random.Generator) -> None:
+        self._space, self._hold, self._rng = action_space, hold, rng
+        self._age = 0
+        self._action: Array | None = None
+
+    def __call__(self, obs: Array, episode_start: bool) -> Array:
+        """The held action, or a new one when its time is over or an episode begins."""
+        if episode_start or self._action is None or self._age >= self._hold:
+            self._action, self._age = self._rng.uniform(self._space.low, self._space.high), 0
+        self._age += 1
+        return self._action.astype(self._space.dtype)
+
+
+class PlanningPolicy:
+    """The agent's own planning, with a model that does not change."""
+
+    def __init__(
+        self,
+        model: Model,
+        members: int,
+        reward_fn: RewardFn,
+        planner: Planner,
+        scale: ActionScale,
+        generator: torch.Generator,
+    ) -> None:
+        self._model, self._members, self._reward_fn = model, members, reward_fn
+        self._planner, self._scale, self._generator = planner, scale, generator
+        self._plan: Tensor | None = None
+
+    @torch.no_grad()
+    def __call__(self, obs: Array, episode_start: bool) -> Array:
+        """Plans from where the last plan left off."""
+        if self._plan is None or episode_start:
+            self._plan = torch.zeros(1, self._planner.horizon, len(self._scale.low))
+        state = torch.as_tensor(obs, dtype=torch.float32)[None]
+
+        def judge(tau: Tensor) -> Tensor:
+            return imagine(self._model, self._reward_fn, state, tau, self._members)
+
+        action, plan = self._planner.plan(judge, self._plan, self._generator)
+        self._plan = shift(plan)
+        return self._scale.from_unit(action[0]).numpy()
+
+
+@dataclass(frozen=True)
+class make_held_uniform:  # noqa: N801 (a function with arguments bound, which can be pickled)
+    """Makes a :class:`HeldUniformPolicy`.
+
+    Attributes:
+        hold: Steps that an action is held.
+    """
+
+    hold: int
+
+    def __call__(self, env: gym.Env[Any, Any], situation: int, rng: np.random.Generator) -> Policy:
+        """See :data:`MakePolicy`."""
+        return HeldUniformPolicy(env.action_space, self.hold, rng)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class make_planning:  # noqa: N801
+    """Makes a :class:`PlanningPolicy` that knows which situation it is in.
+
+    Attributes:
+        model: On the CPU.
+        planner: Looks for the actions.
+        reward_fn: r(s, a, s') for actions of the environment; None takes the environment's own.
+    """
+
+    model: Dynamics
+    planner: Planner
+    reward_fn: RewardFn | None
+
+    @torch.no_grad()
+    def __call__(self, env: gym.Env[Any, Any], situation: int, rng: np.random.Generator) -> Policy:
+        """See :data:`MakePolicy`."""
+        space: Any = env.action_space
+        scale = ActionScale(*(torch.as_tensor(end, dtype=torch.float32) for end in (space.low, space.high)))
+        in_env_units: RewardFn = self.reward_fn or env.get_wrapper_attr("reward_fn")
+        simulator = self.model.simulator(self.model.parameters_by_name(), self.model.embeddings[:, situation])
+        return PlanningPolicy(
+            simulator,
+            self.model.members,
+            lambda obs, action, next_obs: in_env_units(obs, scale.from_unit(action), next_obs),
+            self.planner,
+            scale,
+            torch.Generator().manual_seed(int(rng.integers(2**63))),
+        )

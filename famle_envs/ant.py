@@ -1,0 +1,208 @@
+"""A four-legged robot of eight torque-controlled joints that has to run forwards (the paper's section V-B)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import pybullet
+from gymnasium import spaces
+
+from famle_envs.bullet_env import Array, BulletEnv
+from famle_envs.situation import Situation
+
+__all__ = ["AntEnv"]
+
+N_JOINTS = 8
+MAX_TORQUE = 1000.0  # of a motor at action 1 (N m)
+FLOOR_FRICTION = 0.8
+FALLEN_HEIGHT = 0.26  # of the torso's centre; its radius is 0.25 (m)
+CONTROL_RATE = 60.6  # of the authors' code (Hz); the paper says 100
+_SUBSTEPS = 4  # physics steps a control step
+_START_HEIGHT = 0.5  # feet just above the floor (m)
+_START_ANGLES = (0.0, math.pi / 4) * (N_JOINTS // 2)
+_START_NOISE = 0.1  # of the joint angles (rad)
+_X_VELOCITY = 13
+_OBS_DIM = 27
+
+_TRAINING = (
+    Situation(name="intact"),
+    *(Situation(motor_gain=(1.0,) * joint + (0.0,), name=f"joint {joint} dead") for joint in range(N_JOINTS)),
+    *(
+        Situation(orientation_error=math.radians(degrees), name=f"yaw sensor off by {degrees} deg")
+        for degrees in range(30, 360, 30)
+    ),
+)
+
+
+class AntEnv(BulletEnv):
+    """``FamleAnt-v0``: four legs of a hip (even joints) and an ankle (odd joints) each, at 60.6 Hz.
+
+    The legs are front left, back left, back right and front right; forwards is +x, left is +y.
+
+    ## Action
+    (8,) in [-1, 1]: joint torques in units of 1,000 N m.
+
+    ## Observation
+    (27,): height of the torso in m; its orientation as a unit quaternion (x, y, z, w) with w >= 0; 8 joint angles in
+    rad (hips -0.524 to 0.524, ankles 0.524 to 1.047, downwards where positive); the torso's velocity in m/s and
+    angular velocity in rad/s, in world axes; 8 joint velocities in rad/s.
+
+    ## Reward
+    The torso's velocity along the world's x axis in m/s. Solved: a return above 800 in 1,000 steps.
+
+    ## Episode
+    1,000 steps. A fallen ant (torso below 0.26 m) goes on, but with ``terminate_when_fallen``. The joint angles at the
+    start are random, +-0.1 rad around the middle of their ranges.
+
+    ## Situations
+    ``motor_gain`` (weak, dead or reversed), ``locked_joints``, ``orientation_error`` (of the measured yaw; velocities
+    are measured as they are) and ``friction`` (of the floor). :attr:`training_situations` holds the paper's 20.
+
+    Args:
+        control_rate: Control steps per second, of four physics steps each: 60.6 as in the authors' code, or 100 as
+            in the paper.
+        terminate_when_fallen: Whether a fall ends the episode.
+        situation: See :class:`BulletEnv`.
+        render_mode: See :class:`BulletEnv`.
+
+    Raises:
+        ValueError: The control rate is outside 50 to 500 Hz; and as :class:`BulletEnv`.
+
+    Example:
+        >>> import gymnasium as gym, famle_envs
+        >>> env = gym.make("FamleAnt-v0", situation="joint 3 dead, yaw sensor off by 40 deg")
+        >>> obs, info = env.reset(seed=0)
+        >>> obs.shape
+        (27,)
+        >>> env.close()
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 60}  # noqa: RUF012 (Gymnasium's own type)
+
+    asset = "ant.urdf"
+    joints = tuple(range(N_JOINTS))
+    supported_faults = frozenset({"motor_gain", "locked_joints", "orientation_error", "friction"})
+    time_step = 1.0 / CONTROL_RATE
+    physics_steps = 1
+    substeps = _SUBSTEPS
+    solver_iterations = 50
+    quaternion_dims = (1, 2, 3, 4)
+    training_situations = _TRAINING
+    presets: ClassVar[Mapping[str, Situation]] = {situation.name: situation for situation in _TRAINING} | {
+        "paper": Situation(motor_gain=(1, 1, 0), orientation_error=math.radians(45), name="paper")
+    }
+
+    def __init__(
+        self,
+        *,
+        control_rate: float = CONTROL_RATE,
+        terminate_when_fallen: bool = False,
+        situation: Situation | Mapping[str, Any] | str | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if not 50.0 <= control_rate <= 500.0:
+            raise ValueError(f"control_rate must lie between 50 and 500 Hz, got {control_rate!r}.")
+        self.time_step = 1.0 / control_rate  # type: ignore[misc]  # an instance's own rate
+        self.terminate_when_fallen = terminate_when_fallen
+        self.observation_space = spaces.Box(-np.inf, np.inf, (_OBS_DIM,))
+        self.action_space = spaces.Box(-1.0, 1.0, (N_JOINTS,))
+        super().__init__(situation=situation, render_mode=render_mode)
+
+    def reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
+        """The velocity along x after each transition.
+
+        Args:
+            obs: Observations, (..., 27); a NumPy array or a torch tensor. Not used.
+            action: Actions, (..., 8). Not used.
+            next_obs: Observations one step later, (..., 27).
+
+        Returns:
+            Rewards in m/s, (...), in the type of ``next_obs``.
+        """
+        return next_obs[..., _X_VELOCITY]
+
+    @classmethod
+    def sample_situation(cls, rng: np.random.Generator) -> Situation:
+        """Draws an unseen situation of the paper's kind: a dead joint and an error of the measured yaw together.
+
+        Args:
+            rng: The generator to draw from. The error is uniform in all directions, but at least 15 degrees.
+        """
+        joint = int(rng.integers(N_JOINTS))
+        yaw = rng.uniform(math.radians(15), math.radians(345))
+        return Situation(motor_gain=(1.0,) * joint + (0.0,), orientation_error=yaw)
+
+    def _load_robot(self, path: str, client: int) -> int:
+        plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
+        self._floor = pybullet.createMultiBody(0.0, plane, physicsClientId=client)
+        if self.render_mode is not None:
+            self._draw_floor(client)
+        robot = pybullet.loadURDF(
+            path, (0.0, 0.0, _START_HEIGHT), flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client
+        )
+        # Every PyBullet joint has a velocity motor that brakes it until its force is taken away.
+        pybullet.setJointMotorControlArray(
+            robot, self.joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * N_JOINTS, physicsClientId=client
+        )
+        return int(robot)
+
+    @staticmethod
+    def _draw_floor(client: int) -> None:
+        """Tiles of 1 m under the robot's way, so that its speed can be seen; they touch nothing."""
+        for rgba, parity in (((0.93, 0.93, 0.9, 1.0), 0), ((0.78, 0.82, 0.85, 1.0), 1)):
+            tile = pybullet.createVisualShape(
+                pybullet.GEOM_BOX, halfExtents=(0.5, 0.5, 0.005), rgbaColor=rgba, physicsClientId=client
+            )
+            places = [(x, y, -0.005) for x in range(-6, 60) for y in range(-6, 7) if (x + y) % 2 == parity]
+            pybullet.createMultiBody(
+                baseVisualShapeIndex=tile, basePosition=places[0], batchPositions=places, physicsClientId=client
+            )
+
+    def _perturb_start(self) -> None:
+        noise = self.np_random.uniform(-_START_NOISE, _START_NOISE, N_JOINTS)
+        for joint, angle in zip(self.joints, (noise + _START_ANGLES).tolist(), strict=True):
+            pybullet.resetJointState(self._robot, joint, angle, physicsClientId=self._world)
+
+    def _apply_situation(self) -> None:
+        super()._apply_situation()
+        self._torque = MAX_TORQUE * np.array(self._situation.motor_gain)
+        half = 0.5 * self._situation.orientation_error
+        self._yaw_error = (math.cos(half), math.sin(half))
+        pybullet.changeDynamics(
+            self._floor, -1, lateralFriction=FLOOR_FRICTION * self._situation.friction, physicsClientId=self._world
+        )
+
+    def _actuate(self, action: Array) -> None:
+        pybullet.setJointMotorControlArray(
+            self._robot,
+            self.joints,
+            pybullet.TORQUE_CONTROL,
+            forces=(self._torque * action).tolist(),
+            physicsClientId=self._world,
+        )
+
+    def _observe(self) -> Array:
+        robot, world = self._robot, self._world
+        position, quaternion = pybullet.getBasePositionAndOrientation(robot, physicsClientId=world)
+        velocity, angular_velocity = pybullet.getBaseVelocity(robot, physicsClientId=world)
+        angles, speeds, _, _ = zip(*pybullet.getJointStates(robot, self.joints, physicsClientId=world), strict=True)
+        return np.array(
+            (position[2], *self._measured(*quaternion), *angles, *velocity, *angular_velocity, *speeds),
+            dtype=np.float32,
+        )
+
+    def _measured(self, x: float, y: float, z: float, w: float) -> tuple[float, float, float, float]:
+        """The quaternion turned about the vertical by the error of the yaw sensor, with w >= 0."""
+        c, s = self._yaw_error
+        turned = (c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z)
+        return turned if turned[3] >= 0.0 else (-turned[0], -turned[1], -turned[2], -turned[3])
+
+    def _has_ended(self, obs: Array) -> bool:
+        return self.terminate_when_fallen and bool(obs[0] < FALLEN_HEIGHT)
+
+    def _camera(self) -> dict[str, Any]:
+        position, _ = pybullet.getBasePositionAndOrientation(self._robot, physicsClientId=self._world)
+        return {"cameraTargetPosition": position, "distance": 3.2, "yaw": 20, "pitch": -30, "roll": 0}
