@@ -36,7 +36,7 @@ from torch import Tensor
 
 from benchmarks.harness import Result, provenance, write_json
 from benchmarks.report import interquartile_mean, quartiles
-from famle_agent.adaptation import Candidates, Memory, adapt, prior
+from famle_agent.adaptation import Candidates, Memory, adapt, prior, window_posterior
 from famle_agent.dynamics import Dynamics
 from famle_agent.inner_loop import InnerLoop
 from famle_agent.maml import MAML
@@ -131,7 +131,8 @@ class Learner:
         sines, alone = len(points.weight), Candidates.of(self.model, compose=False)
         data = self.model.encode(points.obs, points.action, points.next_obs, points.weight)
         points = replace(points, log_p=alone.log_likelihood(self.model, data))
-        belief = adapt(self.model, alone, points, self.inner_loop, prior(self.model, alone, sines))
+        belief = replace(prior(self.model, alone, sines), log_posterior=window_posterior(alone, points))
+        belief = adapt(self.model, alone, points, self.inner_loop, belief)
         x = GRID.expand(sines, -1)[..., None]
         simulator = self.model.simulator(belief.theta, belief.h)
         return (simulator(x, torch.zeros(sines, len(GRID), 0)) - x)[..., 0].detach()

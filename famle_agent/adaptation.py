@@ -6,6 +6,7 @@ h_i + h_j - h_0 is the situation with both faults, if h_0 is the intact robot.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -15,7 +16,7 @@ from torch import Tensor
 from famle_agent.dynamics import Batch, Dynamics, Theta, expand
 from famle_agent.inner_loop import InnerLoop
 
-__all__ = ["Belief", "Candidates", "Memory", "adapt", "prior"]
+__all__ = ["Belief", "Candidates", "Memory", "adapt", "filtered_posterior", "prior", "window_posterior"]
 
 
 @dataclass(frozen=True)
@@ -184,6 +185,28 @@ def prior(model: Dynamics, candidates: Candidates, robots: int) -> Belief:
     return Belief(theta, h, candidates.log_prior.expand(robots, -1))
 
 
+def window_posterior(candidates: Candidates, memory: Memory) -> Tensor:
+    """Log P(candidate | D_M) but for a constant, (B, C): the paper's likelihood of the last M transitions."""
+    return candidates.log_prior + (memory.log_p * memory.weight[..., None]).sum(dim=1)
+
+
+def filtered_posterior(candidates: Candidates, log_posterior: Tensor, log_p: Tensor, hazard: float) -> Tensor:
+    """Log P(candidate | all transitions) of a robot that may break at any step, (B, C).
+
+    The forward filter of a hidden Markov model whose state is redrawn from the prior with probability ``hazard``. A
+    window has to forget the robot as it was before it believes in its damage; the filter believes as soon as the
+    new evidence outweighs the hazard.
+
+    Args:
+        candidates: Have a prior.
+        log_posterior: After the transitions before, (B, C).
+        log_p: Log-likelihood of the newest transition under each candidate, (B, C).
+        hazard: Probability of a change per step.
+    """
+    stays = log_posterior.log_softmax(dim=1) + math.log1p(-hazard)
+    return (torch.logaddexp(stays, candidates.log_prior + math.log(hazard)) + log_p).log_softmax(dim=1)
+
+
 @torch.no_grad()
 def adapt(model: Dynamics, candidates: Candidates, memory: Memory, inner_loop: InnerLoop, belief: Belief) -> Belief:
     """Lines 6 and 7 of Algorithm 2 for B robots at once.
@@ -193,17 +216,19 @@ def adapt(model: Dynamics, candidates: Candidates, memory: Memory, inner_loop: I
         candidates: The embeddings to select from.
         memory: D_M.
         inner_loop: k steps of gradient descent; where they diverge, theta_meta and the embedding stay.
-        belief: The belief until now; of it only the number of adaptations lives on.
+        belief: Its posterior counts; theta* and h* are found anew.
     """
     robots, members = len(memory.weight), model.members
 
     # h_likely = argmax log p(D_M | theta_meta, h) over the candidates (line 6).
-    log_posterior = candidates.log_prior + (memory.log_p * memory.weight[..., None]).sum(dim=1)
+    log_posterior = belief.log_posterior
     h_likely = candidates.h[:, log_posterior.argmax(dim=1)].transpose(0, 1).flatten(0, 1)
 
     # theta*, h* = k steps from theta_meta, h_likely (line 7), each member of the ensemble by itself.
     theta_meta = expand(model.parameters_by_name(), robots)
     start = Belief(theta_meta, h_likely, log_posterior, belief.adaptations + 1)
+    if inner_loop.steps == 0:
+        return start
     data = model.encode(memory.obs, memory.action, memory.next_obs, memory.weight)
     seen = Batch(*(values.repeat_interleave(members, dim=0) for values in (data.x, data.y, data.weight)))
     theta, h, _ = inner_loop(model, start.theta, start.h, lambda: seen)

@@ -57,6 +57,10 @@ class ModelBasedAgent(SimulationLearner):
         """How well each candidate explains a transition of each of B robots, (B, C); actions in [-1, 1]."""
 
     @abstractmethod
+    def _infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
+        """The belief with a posterior that knows of the newest transition of the robots that ``moved`` (B,)."""
+
+    @abstractmethod
     def _adapt(self, memory: Memory, belief: Belief) -> Belief:
         """What B robots believe after the transitions in their memory."""
 
@@ -233,6 +237,7 @@ class ModelBasedAgent(SimulationLearner):
         return OnlineLoop(
             prior=self._prior,
             log_likelihood=self._log_likelihood,
+            infer=self._infer,
             adapt=self._adapt,
             simulator=lambda belief: model.simulator(belief.theta, belief.h),
             reward_fn=self._unit_reward_fn(),

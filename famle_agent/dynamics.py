@@ -113,9 +113,8 @@ class Dynamics(nn.Module):
         self.angle_dims, self.quaternion_dims = list(angle_dims), list(quaternion_dims)
         special = {*angle_dims, *quaternion_dims}
         self.other_dims = [dim for dim in range(obs_dim) if dim not in special]
-        pairs = list(combinations_with_replacement(self.quaternion_dims, 2))
-        self._left, self._right = [i for i, _ in pairs], [j for _, j in pairs]
-        self.n_features = len(self.other_dims) + 2 * len(self.angle_dims) + len(pairs)
+        self.quaternion_pairs = list(combinations_with_replacement(range(len(self.quaternion_dims)), 2))
+        self.n_features = len(self.other_dims) + 2 * len(self.angle_dims) + len(self.quaternion_pairs)
         self.n_layers = len(hidden) + 1
 
         sizes = [self.n_features + action_dim, *hidden, obs_dim]
@@ -169,7 +168,9 @@ class Dynamics(nn.Module):
             angles = obs[..., self.angle_dims]
             parts += [angles.sin(), angles.cos()]
         if self.quaternion_dims:
-            parts.append(obs[..., self._left] * obs[..., self._right])
+            q = obs[..., self.quaternion_dims]
+            left, right = zip(*self.quaternion_pairs, strict=True)
+            parts.append(q[..., left] * q[..., right])
         return torch.cat(parts, dim=-1)
 
     def targets(self, obs: Tensor, next_obs: Tensor) -> Tensor:
@@ -306,13 +307,26 @@ class Simulator:
     def __init__(self, model: Dynamics, network: Network) -> None:
         self._model = model
         (first_weight, first_bias), (last_weight, last_bias) = network[0], network[-1]
-        obs_weight = first_weight[:, : model.n_features] / model.input_std[:, None]
-        first = (
-            torch.cat([obs_weight, first_weight[:, model.n_features :]], dim=1),
-            first_bias - (model.input_mean @ obs_weight)[:, None],
-        )
+        from_features = first_weight[:, : model.n_features] / model.input_std[:, None]
+        bias = first_bias - (model.input_mean @ from_features)[:, None]
+        first = torch.cat([self._from_inputs(from_features), first_weight[:, model.n_features :]], dim=1), bias
         last = (last_weight * model.target_std, last_bias * model.target_std + model.target_mean)
         self._network = [first, *network[1:-1], last]
+
+    def _from_inputs(self, from_features: Tensor) -> Tensor:
+        """First-layer weights for the inputs of :meth:`__call__`, which copy as little as possible.
+
+        All of the observation goes in, with weights of 0 for what enters otherwise; and all 16 products of a
+        quaternion instead of the 10 that differ.
+        """
+        model = self._model
+        n_other, n_angles = len(model.other_dims), len(model.angle_dims)
+        other, angles, products = from_features.tensor_split([n_other, n_other + 2 * n_angles], dim=1)
+        plain = from_features.new_zeros(len(from_features), model.obs_dim, from_features.shape[2])
+        plain[:, model.other_dims] = other
+        square = from_features.new_zeros(len(from_features), len(model.quaternion_dims) ** 2, from_features.shape[2])
+        square[:, [4 * i + j for i, j in model.quaternion_pairs]] = products
+        return torch.cat([plain, angles, square], dim=1)
 
     def __call__(self, obs: Tensor, action: Tensor) -> Tensor:
         """Predicts the next observations, (B, n, obs_dim), angles not wrapped.
@@ -321,8 +335,22 @@ class Simulator:
             obs: Observations, (B, n, obs_dim).
             action: Actions in [-1, 1], (B, n, action_dim).
         """
-        x = torch.cat([self._model.features(obs), action], dim=-1)
-        return obs + self._model.forward(self._network, x)
+        parts = [obs]
+        if self._model.angle_dims:
+            angles = _take(obs, self._model.angle_dims)
+            parts += [angles.sin(), angles.cos()]
+        if self._model.quaternion_dims:
+            q = _take(obs, self._model.quaternion_dims)
+            parts.append((q[..., None] * q[..., None, :]).flatten(-2))
+        change = self._model.forward(self._network, torch.cat([*parts, action], dim=-1))
+        return change.add_(obs) if not change.requires_grad else change + obs
+
+
+def _take(values: Tensor, dims: list[int]) -> Tensor:
+    """Some of the last dimensions; a view where they follow each other."""
+    if dims == list(range(dims[0], dims[-1] + 1)):
+        return values[..., dims[0] : dims[-1] + 1]
+    return values[..., dims]
 
 
 def _rows(h: Tensor) -> Tensor:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
+import torch
 from torch import Tensor
 
-from famle_agent.adaptation import Belief, Candidates, Memory, adapt, prior
+from famle_agent.adaptation import Belief, Candidates, Memory, adapt, filtered_posterior, prior, window_posterior
 from famle_agent.agent import ModelBasedAgent
 from famle_agent.dashboard import log_embeddings
+from famle_agent.dynamics import Dynamics
 from famle_agent.meta_learning import MetaStep
 from famle_agent.online import OnlineState
 from famle_agent.transitions import Transitions
@@ -29,6 +32,9 @@ class FAMLE(ModelBasedAgent):
         ('intact', 'joint 0 dead')
     """
 
+    _known: tuple[Dynamics, Candidates] | None = None
+    """The model that the candidates were computed of, and they."""
+
     def _learn_model(
         self, transitions: Transitions, round_: int, last: bool, on_iteration: Callable[[dict[str, float]], bool]
     ) -> None:
@@ -39,6 +45,7 @@ class FAMLE(ModelBasedAgent):
             self.dynamics = self._new_dynamics(n_situations=len(transitions.situations))
             self.dynamics.fit_normalisation(obs, next_obs)
         model = self._require_dynamics()
+        self._known = None
         data = model.encode(obs, action, next_obs)
 
         def log(step: MetaStep) -> bool:
@@ -53,7 +60,10 @@ class FAMLE(ModelBasedAgent):
             log_embeddings(self.logger, model.embeddings[0], self.situations, self.num_timesteps)
 
     def _candidates(self) -> Candidates:
-        return Candidates.of(self._require_dynamics(), self.hyperparameters.compose)
+        model, compose = self._require_dynamics(), self.hyperparameters.compose
+        if self._known is None or self._known[0] is not model:
+            self._known = model, Candidates.of(model, compose)
+        return self._known[1]
 
     def posterior(self, state: OnlineState | None = None) -> dict[str, float]:
         """P(situation | memory) by name, of the first robot; of what the agent believes now, or of a state.
@@ -76,7 +86,13 @@ class FAMLE(ModelBasedAgent):
     def _log_likelihood(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
         model = self._require_dynamics()
         transition = model.encode(obs[:, None], action[:, None], next_obs[:, None])
-        return self._candidates().log_likelihood(model, transition)[:, 0]
+        return self.hyperparameters.likelihood_power * self._candidates().log_likelihood(model, transition)[:, 0]
+
+    def _infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
+        if hazard := self.hyperparameters.hazard:
+            new = filtered_posterior(self._candidates(), belief.log_posterior, memory.log_p[:, -1], hazard)
+            return replace(belief, log_posterior=torch.where(moved[:, None], new, belief.log_posterior))
+        return replace(belief, log_posterior=window_posterior(self._candidates(), memory))
 
     def _adapt(self, memory: Memory, belief: Belief) -> Belief:
         """Algorithm 2, lines 6 and 7: the most likely embedding, then k gradient steps on theta and h."""

@@ -56,6 +56,10 @@ class Hyperparameters:
         meta_batch_size: Situations per iteration of Algorithm 1; the paper's is 1.
         compose: Whether the most likely embedding is looked for among the sums of two training situations too, which
             stand for both faults at once; the paper has none.
+        likelihood_power: Exponent of the likelihood of a transition; below 1 where errors are not independent of each
+            other, so that one strange moment does not overturn what many have shown. The paper's is 1.
+        hazard: Probability per step that the robot breaks (or is repaired), for a posterior that is filtered over all
+            transitions; 0 takes the likelihood of the last M, as the paper does.
         adapt_every: K, robot steps between two adaptations; 0 never adapts.
         memory_size: M, transitions that adaptation looks back on.
         adapt_steps: k of online adaptation; None takes ``inner_steps``, 0 only selects an embedding.
@@ -100,6 +104,8 @@ class Hyperparameters:
     embedding_meta_lr: float = 1.0
     meta_batch_size: int = 20
     compose: bool = False
+    likelihood_power: float = 1.0
+    hazard: float = 0.0
     adapt_every: int = 5
     memory_size: int = 50
     adapt_steps: int | None = None
@@ -121,6 +127,8 @@ class Hyperparameters:
             value = getattr(self, name)
             if value is not None and not value >= least:
                 raise ValueError(f"{name} must be at least {least}, got {value!r}.")
+        if self.hazard >= 1.0:
+            raise ValueError(f"hazard is a probability below 1, got {self.hazard!r}.")
         if not self.hidden or min(self.hidden) < 1:
             raise ValueError(f"hidden must name the width of at least one layer, got {self.hidden}.")
         for name, choices in _CHOICES.items():
@@ -201,7 +209,17 @@ class Hyperparameters:
 
 
 _ONLINE = {
-    *("compose", "adapt_every", "memory_size", "adapt_steps", "adapt_lr", "adapt_embedding_lr", "forget_at_reset"),
+    *(
+        "compose",
+        "likelihood_power",
+        "hazard",
+        "adapt_every",
+        "memory_size",
+        "adapt_steps",
+        "adapt_lr",
+        "adapt_embedding_lr",
+        "forget_at_reset",
+    ),
     *("planner", "horizon", "candidates", "planner_iterations", "elites", "init_std", "noise_beta", "temperature"),
 }
 """Settings of the life on a robot; rounds in simulation plan too, but a model may be used with another planner."""
@@ -212,7 +230,16 @@ _AT_LEAST_ONE = (
 )
 _AT_LEAST_ZERO = (
     *("rounds", "interaction_rank", "degrees_of_freedom", "joint_iterations", "round_iterations", "meta_iterations"),
-    *("joint_lr", "joint_embedding_lr", "inner_lr", "embedding_lr", "meta_lr", "embedding_meta_lr"),
+    *(
+        "likelihood_power",
+        "hazard",
+        "joint_lr",
+        "joint_embedding_lr",
+        "inner_lr",
+        "embedding_lr",
+        "meta_lr",
+        "embedding_meta_lr",
+    ),
     *("adapt_every", "adapt_steps", "adapt_lr", "adapt_embedding_lr", "init_std", "noise_beta", "temperature"),
 )
 _LEAST = dict.fromkeys(_AT_LEAST_ONE, 1) | dict.fromkeys(_AT_LEAST_ZERO, 0)

@@ -67,7 +67,8 @@ class OnlineLoop:
     Attributes:
         prior: What B robots believe before they have seen anything.
         log_likelihood: Log-likelihood of a transition of each robot under each candidate, (B, C).
-        adapt: The belief after the transitions in the memory (lines 6 and 7).
+        infer: The belief with its posterior brought up to date after each transition, for the robots that had one.
+        adapt: The belief with the model brought up to date (lines 6 and 7).
         simulator: The model that a belief stands for.
         reward_fn: r(s, a, s') with actions in [-1, 1].
         planner: MPC (line 8).
@@ -78,6 +79,7 @@ class OnlineLoop:
 
     prior: Callable[[int], Belief]
     log_likelihood: Callable[[Tensor, Tensor, Tensor], Tensor]
+    infer: Callable[[Memory, Belief, Tensor], Belief]
     adapt: Callable[[Memory, Belief], Belief]
     simulator: Callable[[Belief], Model]
     reward_fn: RewardFn
@@ -105,7 +107,8 @@ class OnlineLoop:
         memory = state.memory.add(*state.last, obs, self.log_likelihood(*state.last, obs), valid=~starts)
         if starts.all():
             return replace(state, last=None)
-        state = replace(state, memory=memory, last=None, steps=state.steps + 1)
+        belief = self.infer(memory, state.belief, ~starts) if self.adapt_every else state.belief
+        state = replace(state, memory=memory, belief=belief, last=None, steps=state.steps + 1)
         if self.adapt_every and state.steps % self.adapt_every == 0:
             state = replace(state, belief=self.adapt(state.memory, state.belief))
         return state

@@ -115,8 +115,7 @@ class make_planning:  # noqa: N801
     @torch.no_grad()
     def __call__(self, env: gym.Env[Any, Any], situation: int, rng: np.random.Generator) -> Policy:
         """See :data:`MakePolicy`."""
-        space: Any = env.action_space
-        scale = ActionScale(*(torch.as_tensor(end, dtype=torch.float32) for end in (space.low, space.high)))
+        scale = ActionScale.of(env.action_space, torch.device("cpu"))  # type: ignore[arg-type]
         in_env_units: RewardFn = self.reward_fn or env.get_wrapper_attr("reward_fn")
         simulator = self.model.simulator(self.model.parameters_by_name(), self.model.embeddings[:, situation])
         return PlanningPolicy(

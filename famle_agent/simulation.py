@@ -378,7 +378,7 @@ class SimulationLearner(BaseAlgorithm):
         return self._reward_fn or self._env_reward_fn
 
     def _action_scale(self) -> ActionScale:
-        return ActionScale(*self._tensors(self.action_space.low, self.action_space.high))
+        return ActionScale.of(self.action_space, self.device)
 
     def _require_env(self) -> VecEnv:
         if self.env is None:

@@ -103,9 +103,10 @@ class AntEnv(BulletEnv):
         situation: Situation | Mapping[str, Any] | str | None = None,
         render_mode: str | None = None,
     ) -> None:
-        if not 50.0 <= control_rate <= 500.0:
-            raise ValueError(f"control_rate must lie between 50 and 500 Hz, got {control_rate!r}.")
-        self.time_step = 1.0 / control_rate  # type: ignore[misc]  # an instance's own rate
+        if not isinstance(control_rate, (int, float)) or not 50.0 <= control_rate <= 500.0:
+            raise ValueError(f"control_rate must be a number between 50 and 500 Hz, got {control_rate!r}.")
+        self.time_step = 1.0 / control_rate  # type: ignore[misc]  # each ant has a rate of its own
+        self.metadata = {**self.metadata, "render_fps": round(control_rate)}
         self.terminate_when_fallen = terminate_when_fallen
         self.observation_space = spaces.Box(-np.inf, np.inf, (_OBS_DIM,))
         self.action_space = spaces.Box(-1.0, 1.0, (N_JOINTS,))
@@ -140,14 +141,8 @@ class AntEnv(BulletEnv):
         self._floor = pybullet.createMultiBody(0.0, plane, physicsClientId=client)
         if self.render_mode is not None:
             self._draw_floor(client)
-        robot = pybullet.loadURDF(
-            path, (0.0, 0.0, _START_HEIGHT), flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client
-        )
-        # Every PyBullet joint has a velocity motor that brakes it until its force is taken away.
-        pybullet.setJointMotorControlArray(
-            robot, self.joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * N_JOINTS, physicsClientId=client
-        )
-        return int(robot)
+        start = (0.0, 0.0, _START_HEIGHT)
+        return int(pybullet.loadURDF(path, start, flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client))
 
     @staticmethod
     def _draw_floor(client: int) -> None:
@@ -168,6 +163,10 @@ class AntEnv(BulletEnv):
 
     def _apply_situation(self) -> None:
         super()._apply_situation()
+        # A joint has a motor of its own, which brakes it from the start, or holds it where it was locked before.
+        pybullet.setJointMotorControlArray(
+            self._robot, self.joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * N_JOINTS, physicsClientId=self._world
+        )
         self._torque = MAX_TORQUE * np.array(self._situation.motor_gain)
         half = 0.5 * self._situation.orientation_error
         self._yaw_error = (math.cos(half), math.sin(half))

@@ -164,7 +164,7 @@ class BulletEnv(gym.Env[Array, Array]):
         if self._obs is None:
             raise gym.error.ResetNeeded("Call reset() before step().")
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != self.action_space.shape or not math.isfinite(action.sum()):
+        if action.shape != self.action_space.shape or not math.isfinite(np.abs(action).max()):
             raise ValueError(f"The action must be {self.action_space.shape} finite numbers, got {action}.")
         self._actuate(np.minimum(np.maximum(action, self.action_space.low), self.action_space.high))
         self._hold_locked_joints()
