@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import gymnasium as gym
 import tyro
@@ -14,6 +14,7 @@ from rich.console import Console
 from famle_agent.demo import run_demo, run_episode
 from famle_agent.errors import NotLearnedError
 from famle_agent.famle import FAMLE
+from famle_agent.walking import run_walking_demo
 from famle_agent.wrapper import FAMLEWrapper
 
 __all__ = ["main"]
@@ -21,14 +22,14 @@ __all__ = ["main"]
 
 @dataclass(frozen=True)
 class Demo:
-    """Meta-learn a robot from scratch, break it, and watch it adapt."""
+    """Break a robot and watch it adapt: the arm, meta-learned from scratch, between episodes; the ant in mid-run."""
 
-    robot: str = "reacher"
+    robot: Literal["reacher", "ant"] = "reacher"
     """The robot."""
-    situation: str = "paper"
-    """What breaks: a preset or a description such as "joint 0 reversed, joint 3 dead"."""
+    situation: str = ""
+    """What breaks: a preset or a description such as "joint 0 reversed, joint 3 dead"; by default the robot's own."""
     episodes: int = 5
-    """Episodes after the break."""
+    """Episodes after the break, of the arm."""
     out: Path = Path("demo")
     """Folder for the results."""
     seed: int = 0
@@ -38,8 +39,12 @@ class Demo:
 
     def __call__(self) -> None:
         """Runs the demo."""
-        overrides = {} if self.meta_iterations is None else {"meta_iterations": self.meta_iterations}
-        run_demo(self.robot, self.situation, self.episodes, self.out, self.seed, **overrides)
+        overrides: dict[str, Any] = {} if self.meta_iterations is None else {"meta_iterations": self.meta_iterations}
+        overrides |= {"situation": self.situation} if self.situation else {}
+        if self.robot == "ant":
+            run_walking_demo(self.robot, out=self.out, seed=self.seed, **overrides)
+        else:
+            run_demo(self.robot, episodes=self.episodes, out=self.out, seed=self.seed, **overrides)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, ImageDraw
 from rich.console import Console
 from rich.table import Table
 from stable_baselines3.common.logger import Logger, configure
@@ -19,7 +18,7 @@ from famle_agent.agent import ModelBasedAgent
 from famle_agent.dashboard import encode_gif, log_gif, log_posterior
 from famle_agent.famle import FAMLE
 from famle_agent.hyperparameters import known_robots
-from famle_agent.plots import plot_returns
+from famle_agent.plots import plot_returns, side_by_side
 from famle_agent.wrapper import FAMLEWrapper
 
 __all__ = ["Episode", "run_demo", "run_episode"]
@@ -165,17 +164,4 @@ def _write(results: dict[str, list[Episode]], out: Path, title: str, fps: float)
         "broken, without adaptation": frozen[-1].frames,
         "broken, with adaptation": adapting[-1].frames,
     }
-    (out / "robot.gif").write_bytes(encode_gif(_side_by_side(films), fps))
-
-
-def _side_by_side(films: dict[str, list[Frame]], size: int = 320) -> list[Frame]:
-    """The films next to each other under their titles; the shorter ones stop at their last picture."""
-    frames = []
-    for i in range(max(len(film) for film in films.values())):
-        sheet = Image.new("RGB", (size * len(films), size + 24), "white")
-        for column, (title, film) in enumerate(films.items()):
-            picture = Image.fromarray(film[min(i, len(film) - 1)]).resize((size, size))
-            sheet.paste(picture, (size * column, 24))
-            ImageDraw.Draw(sheet).text((size * column + 8, 6), title, fill="black")
-        frames.append(np.asarray(sheet))
-    return frames
+    (out / "robot.gif").write_bytes(encode_gif(side_by_side(films), fps))

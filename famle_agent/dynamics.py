@@ -7,6 +7,7 @@ Parameters are stacked along it, so that B networks cost one batched matrix prod
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -152,6 +153,21 @@ class Dynamics(nn.Module):
     def parameters_by_name(self) -> Theta:
         """Theta as plain tensors without gradient, (P, ...)."""
         return {name: value.detach() for name, value in self.theta.items()}
+
+    def with_members(self, count: int) -> Dynamics:
+        """A model of the first ``count`` members.
+
+        Raises:
+            ValueError: There are not as many.
+        """
+        if not 1 <= count <= self.members:
+            raise ValueError(f"The ensemble has 1 to {self.members} members to give, not {count}.")
+        part = copy.deepcopy(self)
+        for owner, names in ((part.theta, list(self.theta)), (part, ["embeddings"])):
+            for name in names:
+                setattr(owner, name, nn.Parameter(getattr(owner, name).detach()[:count].clone()))
+        part.noise_std = self.noise_std[:count].clone()
+        return part
 
     def embeddings_of(self, c: Tensor) -> Tensor:
         """The embeddings of situations c (B,) in every member, (B * P, embedding_dim)."""

@@ -1,15 +1,21 @@
-"""Pictures of returns."""
+"""Pictures of returns and speeds, and films side by side."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from PIL import Image, ImageDraw
 
-__all__ = ["plot_returns", "style"]
+__all__ = ["Frames", "plot_returns", "plot_speed", "running_mean", "side_by_side", "style"]
+
+Frames = Sequence[npt.NDArray[np.uint8]]
 
 
 def style(axes: Axes, xlabel: str, ylabel: str, title: str = "") -> None:
@@ -39,3 +45,55 @@ def plot_returns(returns: Mapping[str, Sequence[float]], title: str, path: str |
     style(axes, "episode", "return", title)
     axes.legend()
     figure.savefig(path, dpi=150)
+
+
+def running_mean(values: npt.NDArray[Any], window: int) -> npt.NDArray[Any]:
+    """The mean of the last ``window`` values at each place, of fewer where there are not as many yet."""
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    end = np.arange(1, len(values) + 1)
+    start = np.maximum(0, end - window)
+    mean: npt.NDArray[Any] = (total[end] - total[start]) / (end - start)
+    return mean
+
+
+def plot_speed(
+    speed: Mapping[str, npt.NDArray[Any]], break_at: int, rate: float, title: str, path: str | os.PathLike[str]
+) -> None:
+    """Draws speeds over time, means over half a second.
+
+    Args:
+        speed: Speed at each step in m/s by the name of the agent.
+        break_at: The first step of the broken robot.
+        rate: Steps per second.
+        title: Of the picture.
+        path: Where the PNG goes.
+    """
+    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
+    axes = figure.add_subplot()
+    for name, values in speed.items():
+        axes.plot(np.arange(len(values)) / rate, running_mean(values, round(rate / 2)), label=name)
+    axes.axvline(break_at / rate, color="0.4", linestyle="--", linewidth=1)
+    axes.annotate(
+        "breaks",
+        (break_at / rate, 1.0),
+        xycoords=("data", "axes fraction"),
+        xytext=(4, -12),
+        textcoords="offset points",
+    )
+    axes.axhline(0.0, color="0.8", linewidth=1)
+    style(axes, "time (s)", "forward speed (m/s)", title)
+    axes.legend()
+    figure.savefig(path, dpi=150)
+
+
+def side_by_side(films: Mapping[str, Frames], size: int = 320) -> list[npt.NDArray[np.uint8]]:
+    """The films next to each other under their titles; the shorter ones stop at their last picture."""
+    frames = []
+    for i in range(max(len(film) for film in films.values())):
+        sheet = Image.new("RGB", (size * len(films), size + 24), "white")
+        for column, (title, film) in enumerate(films.items()):
+            picture = Image.fromarray(film[min(i, len(film) - 1)]).resize((size, size))
+            sheet.paste(picture, (size * column, 24))
+            ImageDraw.Draw(sheet).text((size * column + 8, 6), title, fill="black")
+        frames.append(np.asarray(sheet))
+    return frames

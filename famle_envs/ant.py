@@ -139,22 +139,8 @@ class AntEnv(BulletEnv):
     def _load_robot(self, path: str, client: int) -> int:
         plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
         self._floor = pybullet.createMultiBody(0.0, plane, physicsClientId=client)
-        if self.render_mode is not None:
-            self._draw_floor(client)
         start = (0.0, 0.0, _START_HEIGHT)
         return int(pybullet.loadURDF(path, start, flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client))
-
-    @staticmethod
-    def _draw_floor(client: int) -> None:
-        """Tiles of 1 m under the robot's way, so that its speed can be seen; they touch nothing."""
-        for rgba, parity in (((0.93, 0.93, 0.9, 1.0), 0), ((0.78, 0.82, 0.85, 1.0), 1)):
-            tile = pybullet.createVisualShape(
-                pybullet.GEOM_BOX, halfExtents=(0.5, 0.5, 0.005), rgbaColor=rgba, physicsClientId=client
-            )
-            places = [(x, y, -0.005) for x in range(-6, 60) for y in range(-6, 7) if (x + y) % 2 == parity]
-            pybullet.createMultiBody(
-                baseVisualShapeIndex=tile, basePosition=places[0], batchPositions=places, physicsClientId=client
-            )
 
     def _perturb_start(self) -> None:
         noise = self.np_random.uniform(-_START_NOISE, _START_NOISE, N_JOINTS)
@@ -204,4 +190,4 @@ class AntEnv(BulletEnv):
 
     def _camera(self) -> dict[str, Any]:
         position, _ = pybullet.getBasePositionAndOrientation(self._robot, physicsClientId=self._world)
-        return {"cameraTargetPosition": position, "distance": 3.2, "yaw": 20, "pitch": -30, "roll": 0}
+        return {"cameraTargetPosition": position, "distance": 3.0, "yaw": 15, "pitch": -25, "roll": 0}

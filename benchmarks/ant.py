@@ -1,0 +1,274 @@
+"""The ant: unseen damage, damage in the middle of a run, and what each part of FAMLE buys.
+
+python -m benchmarks.ant                              # a dead joint and a yaw error together, new for each replicate
+python -m benchmarks.ant --experiment break           # the same, striking in the middle of a run
+python -m benchmarks.ant --experiment untrained       # kinds of damage that were not trained at all
+python -m benchmarks.ant --experiment intact --methods famle random-shooting --replicates 3
+python -m benchmarks.ant --experiment members         # ensembles of one to four
+
+Replicates share the shipped model; each has its own damage and its own seed of the robot and the planner. The oracle
+and the agent without embeddings are trained from scratch by their method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.harness import Replicate, Result, load_results, run_replicates
+from benchmarks.report import by_method, interquartile_mean, quartiles
+from famle_agent import FAMLE, FAMLEWrapper
+from famle_agent.plots import style
+from famle_agent.walking import BrokenRun, run_and_break
+from famle_envs import Situation
+from famle_envs.ant import AntEnv
+from famle_envs.wrappers import RandomSituation
+
+ENV_ID = "FamleAnt-v0"
+SOLVED = 800.0
+WALKS = 0.8  # m/s
+BIN = 50  # steps of a stored mean speed
+ADAPTS: dict[str, Any] = {"adapt_every": 10, "adapt_steps": 10, "adapt_lr": 3e-4, "adapt_embedding_lr": 1e-2}
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "famle": {},
+    "famle-frozen": {"adapt_every": 0},
+    "famle-nearest": {"compose": False},
+    "famle-window": {"hazard": 0.0, "likelihood_power": 1.0, "memory_size": 100},
+    "famle-h": {**ADAPTS, "adapt_lr": 0.0},
+    "famle-theta": ADAPTS,
+    "random-shooting": {"planner": "random_shooting", "candidates": 10_000},
+}
+"""The shipped agent with settings changed."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Runs replicates that are not stored yet, then reports on all that are."""
+
+    experiment: Literal["unseen", "break", "untrained", "intact", "members", "validation"] = "unseen"
+    """What happens to the robot."""
+    methods: tuple[str, ...] = ()
+    """Entries of METHODS; by default those that belong to the experiment."""
+    replicates: int = 20
+    """Damages, seeded 0, 1, ..."""
+    steps: int = 1000
+    """Robot steps of a replicate, all in one episode."""
+    jobs: int = 2
+    """Parallel processes."""
+    out: Path = Path("benchmarks/results")
+    """Folder of the results."""
+    cache: Path = Path("runs/agents")
+    """Folder of the agents that are trained here."""
+
+
+DEFAULT_METHODS: dict[str, tuple[str, ...]] = {
+    "unseen": ("famle", "famle-frozen", "famle-nearest", "famle-h", "famle-theta"),
+    "validation": ("famle", "famle-window", "famle-h", "famle-theta"),
+    "members": ("members-1", "members-2", "members-3", "famle"),
+    "break": ("famle", "famle-window", "famle-frozen"),
+    "untrained": ("famle", "famle-frozen", "famle-theta"),
+    "intact": ("famle",),
+}
+
+
+def damage_of(experiment: str, seed: int) -> Situation:
+    """The situation of a replicate; only those of "validation" and "members" were looked at while tuning."""
+    if experiment == "intact":
+        return Situation()
+    if experiment == "untrained":
+        return untrained(seed)
+    return AntEnv.sample_situation(
+        np.random.default_rng([7 if experiment in ("validation", "members") else 2020, seed])
+    )
+
+
+def untrained(seed: int) -> Situation:
+    """Damage of a kind that no training situation has: two weak joints, a reversed one, a locked one, another floor."""
+    rng = np.random.default_rng([2021, seed])
+    gain = np.ones(len(AntEnv.joints))
+    one, two = rng.choice(len(gain), size=2, replace=False)
+    kind = seed % 4
+    if kind == 0:
+        gain[[one, two]] = rng.uniform(0.1, 0.6, 2)
+    elif kind == 1:
+        gain[one] = rng.uniform(-1.0, -0.5)
+    elif kind == 2:
+        return Situation(locked_joints=(int(one),))
+    else:
+        return Situation(friction=float(rng.choice([0.25, 0.5, 2.0])))
+    return Situation(motor_gain=tuple(gain))
+
+
+def shipped(seed: int, members: int | None = None, **overrides: Any) -> FAMLE:
+    """The agent that the package ships."""
+    agent = FAMLE("ant", seed=seed, device="cpu", **overrides)
+    if agent.dynamics is None:
+        raise RuntimeError("The package ships no model that fits; make it with: famle meta-learn --robot ant")
+    if members is not None:
+        agent.dynamics = agent.dynamics.with_members(members)
+    return agent
+
+
+def oracle(task: Task) -> FAMLE:
+    """The upper line: from scratch on the very test situation, a quarter of the shipped model's simulation."""
+    path = task.args.cache / f"ant-oracle-{task.args.experiment}-{task.seed}.zip"
+    if not path.exists():
+        agent = FAMLE(
+            "ant",
+            seed=task.seed,
+            device="cpu",
+            compose=False,
+            transitions_per_situation=40_000,
+            joint_iterations=4000,
+            rounds=6,
+            round_transitions=3000,
+            round_iterations=3000,
+        )
+        agent.meta_learn([task.situation]).save(path)
+    return FAMLE.load(path, device="cpu")
+
+
+def without_embeddings(task: Task) -> FAMLE:
+    """One model of all situations, of as much data and as many steps; it can only follow by gradient steps on theta."""
+    path = task.args.cache / "ant-without-embeddings.zip"
+    agent = FAMLE("ant", seed=0, device="cpu", compose=False)
+    if not path.exists():
+        settings, n = agent.hyperparameters, len(AntEnv.training_situations)
+        mixed = FAMLE(
+            "ant",
+            seed=0,
+            device="cpu",
+            compose=False,
+            transitions_per_situation=n * settings.transitions_per_situation,
+            round_transitions=n * settings.round_transitions,
+        )
+        mixed.meta_learn([lambda: RandomSituation(gym.make(ENV_ID))], folder=path.with_suffix("")).save(path)
+    return FAMLE.load(path, device="cpu", **ADAPTS)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One replicate.
+
+    Attributes:
+        seed: Of the robot and the planner, and of the damage.
+        situation: The damage.
+        args: Of the benchmark.
+    """
+
+    seed: int
+    situation: Situation
+    args: Args
+
+
+METHODS: dict[str, Callable[[Task], FAMLE]] = {
+    **{
+        name: partial(lambda task, overrides: shipped(task.seed, **overrides), overrides=o)
+        for name, o in VARIANTS.items()
+    },
+    **{f"members-{n}": partial(lambda task, n: shipped(task.seed, n), n=n) for n in (1, 2, 3)},
+    "without-embeddings": without_embeddings,
+    "oracle": oracle,
+}
+"""Agents by name."""
+
+
+def run(method: str, task: Task) -> Result:
+    """One replicate: broken from the first step, or after 300 steps."""
+    agent, args = METHODS[method](task), task.args
+    agent.set_random_seed(task.seed)
+    break_at = 300 if args.experiment == "break" else 0
+    env = FAMLEWrapper(gym.make(ENV_ID, max_episode_steps=args.steps), agent)
+    if break_at == 0:
+        env.get_wrapper_attr("set_situation")(task.situation)
+    result = run_and_break(env, task.situation, args.steps, break_at, task.seed)
+    env.close()
+    return _result(result, task.situation)
+
+
+def _result(result: BrokenRun, situation: Situation) -> Result:
+    bins = result.speed[: len(result.speed) // BIN * BIN].reshape(-1, BIN).mean(axis=1)
+    milliseconds = 1e3 * result.seconds
+    return {
+        "situation": str(situation),
+        "believed": result.believed[-1],
+        "return": round(float(result.speed.sum()), 1),
+        "recovery": result.recovery(WALKS),
+        "speed": [round(float(value), 3) for value in bins],
+        "break_at": result.break_at,
+        "ms_per_step": {
+            "mean": round(float(milliseconds.mean()), 2),
+            "median": round(float(np.median(milliseconds)), 2),
+            "p99": round(float(np.percentile(milliseconds, 99)), 2),
+        },
+    }
+
+
+def summary(results: list[Result], title: str) -> Table:
+    """One row a method."""
+    table = Table(
+        "method", "n", "return, median (quartiles)", "IQM [95 %]", "> 800", "> 1,200", "recovery", "ms", title=title
+    )
+    for method, runs in by_method(results).items():
+        returns = np.array([run["return"] for run in runs])
+        low, median, high = quartiles(returns)
+        recovery = [np.inf if run["recovery"] is None else run["recovery"] for run in runs]
+        table.add_row(
+            method,
+            str(len(runs)),
+            f"{median:.0f} ({low:.0f}-{high:.0f})",
+            "{:.0f} [{:.0f}, {:.0f}]".format(*interquartile_mean(returns)),
+            f"{(returns > SOLVED).mean():.0%}",
+            f"{(returns > 1200).mean():.0%}",
+            f"{np.median(recovery):.0f}, {np.isfinite(recovery).sum()}/{len(runs)}",
+            f"{np.median([run['ms_per_step']['median'] for run in runs]):.0f}",
+        )
+    return table
+
+
+def plot_speeds(results: list[Result], title: str, path: Path) -> None:
+    """Median speed and quartiles over the robot's steps, a colour a method."""
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    for method, runs in by_method(results).items():
+        low, median, high = quartiles([run["speed"] for run in runs])
+        x = BIN * (0.5 + np.arange(len(median)))
+        (line,) = axes.plot(x, median, label=f"{method} (n = {len(runs)})")
+        axes.fill_between(x, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+    axes.axhline(WALKS, color="0.4", linestyle="--", linewidth=1, label="the paper's solved mark")
+    if break_at := results[0]["break_at"]:
+        axes.axvline(break_at, color="0.4", linestyle=":", linewidth=1, label="breaks")
+    style(axes, "robot steps", "forward speed (m/s)", title)
+    axes.legend(fontsize="small")
+    figure.savefig(path, dpi=150)
+
+
+def main(args: Args) -> None:
+    """Runs and reports."""
+    methods = args.methods or DEFAULT_METHODS[args.experiment]
+    for method in methods:
+        if method not in METHODS:
+            raise ValueError(f"There is no method {method!r}. Methods: {', '.join(METHODS)}.")
+    folder = args.out / f"ant-{args.experiment}"
+    for method in methods:
+        tasks = [Task(seed, damage_of(args.experiment, seed), args) for seed in range(args.replicates)]
+        run_replicates([Replicate(method, task.seed, partial(run, method, task)) for task in tasks], folder, args.jobs)
+    results = load_results(folder)
+    title = f"Ant, {args.experiment}"
+    Console(width=160).print(summary(results, title))
+    plot_speeds(results, title, args.out / f"ant-{args.experiment}.png")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
