@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: install demo test test-fast lint format clean
+.PHONY: install demo demo-ant test test-fast lint format clean
 
 install: $(STAMP)
 
@@ -14,6 +14,9 @@ $(STAMP): setup.cfg pyproject.toml constraints.txt
 
 demo: install  ## Meta-learn an arm, break it, and watch it adapt: a few minutes, results in demo/
 	$(BIN)/famle demo
+
+demo-ant: install  ## Break an ant in mid-run: a minute or two, results in demo-ant/
+	$(BIN)/famle demo --robot ant --out demo-ant
 
 test: lint  ## All that a change must pass
 	$(BIN)/pytest --numprocesses 2 --cov --cov-report term-missing:skip-covered --cov-fail-under 90
@@ -32,4 +35,4 @@ format: install
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) demo runs build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo demo-ant runs build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

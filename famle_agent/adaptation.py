@@ -98,10 +98,10 @@ class Candidates:
 
     @property
     def log_prior(self) -> Tensor:
-        """One fault is as likely as two, (C,)."""
+        """One fault is as likely as two, (C,); probabilities that sum to 1."""
         single = self.pairs[:, 1] == 0
         size = torch.where(single, single.sum(), (~single).sum())
-        return -size.float().log()
+        return (-size.float().log()).log_softmax(dim=0)
 
     def marginal(self, posterior: Tensor) -> Tensor:
         """How likely each training situation is, alone or as a part: (B, C) -> (B, N)."""

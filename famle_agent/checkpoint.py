@@ -95,7 +95,8 @@ def read_checkpoint(file: File) -> tuple[dict[str, Any], dict[str, Tensor]]:
         raise ValueError(f"{path} is no FAMLE checkpoint. Give a file written by agent.save().")
     if meta.get("version") != _VERSION:
         raise ValueError(
-            f"{path} has checkpoint version {meta.get('version')}, this package reads {_VERSION}; upgrade famle."
+            f"{path} has checkpoint version {meta.get('version')}, this package reads {_VERSION}; "
+            "use the release of famle that wrote it, or meta-learn again."
         )
     return meta, tensors
 
@@ -188,6 +189,7 @@ def load_pretrained(agent: ModelBasedAgent, file: File) -> None:
     meta, tensors = read_checkpoint(file)
     alike = (
         meta["class"] == type(agent).__name__
+        and all(meta[name] == list(getattr(agent, f"_{name}")) for name in ("angle_dims", "quaternion_dims"))
         and _world(meta["env"]) == _world(agent._env_spec)
         and Hyperparameters.from_dict(meta["hyperparameters"]).learnt_alike(agent.hyperparameters)
     )

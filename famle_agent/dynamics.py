@@ -305,12 +305,13 @@ class Dynamics(nn.Module):
         x = x.flatten(0, 1).expand(self.members, -1, -1)
         squared = (self.predict(self.parameters_by_name(), h, x) - y.flatten(0, 1)).square()
         weight = weight.reshape(1, -1, 1)
-        variance = (squared * weight).sum(dim=1, keepdim=True) / weight.sum()
+        least = _MIN_STD**2
+        variance = ((squared * weight).sum(dim=1, keepdim=True) / weight.sum()).clamp(min=least)
         for _ in range(20 if nu else 0):
             # Expectation maximisation: a Student-t is a Gaussian whose variance is drawn anew for each value.
             trust = weight * (nu + 1) / (nu + squared / variance)
-            variance = (squared * trust).sum(dim=1, keepdim=True) / weight.sum()
-        self.noise_std.copy_(variance[:, 0].sqrt().clamp(min=_MIN_STD))
+            variance = ((squared * trust).sum(dim=1, keepdim=True) / weight.sum()).clamp(min=least)
+        self.noise_std.copy_(variance[:, 0].sqrt())
 
     def simulator(self, theta: Theta, h: Tensor) -> Simulator:
         """B models of fixed situation for planning, with the normalisation folded into their outer layers."""

@@ -11,7 +11,6 @@ from torch import Tensor
 from famle_agent.adaptation import Belief, Candidates, Memory, adapt, filtered_posterior, prior, window_posterior
 from famle_agent.agent import ModelBasedAgent
 from famle_agent.dashboard import log_embeddings
-from famle_agent.dynamics import Dynamics
 from famle_agent.meta_learning import MetaStep
 from famle_agent.online import OnlineState
 from famle_agent.transitions import Transitions
@@ -32,9 +31,6 @@ class FAMLE(ModelBasedAgent):
         ('intact', 'joint 0 dead')
     """
 
-    _known: tuple[Dynamics, Candidates] | None = None
-    """The model that the candidates were computed of, and they."""
-
     def _learn_model(
         self, transitions: Transitions, round_: int, last: bool, on_iteration: Callable[[dict[str, float]], bool]
     ) -> None:
@@ -45,7 +41,6 @@ class FAMLE(ModelBasedAgent):
             self.dynamics = self._new_dynamics(n_situations=len(transitions.situations))
             self.dynamics.fit_normalisation(obs, next_obs)
         model = self._require_dynamics()
-        self._known = None
         data = model.encode(obs, action, next_obs)
 
         def log(step: MetaStep) -> bool:
@@ -60,10 +55,7 @@ class FAMLE(ModelBasedAgent):
             log_embeddings(self.logger, model.embeddings[0], self.situations, self.num_timesteps)
 
     def _candidates(self) -> Candidates:
-        model, compose = self._require_dynamics(), self.hyperparameters.compose
-        if self._known is None or self._known[0] is not model:
-            self._known = model, Candidates.of(model, compose)
-        return self._known[1]
+        return Candidates.of(self._require_dynamics(), self.hyperparameters.compose)
 
     def posterior(self, state: OnlineState | None = None) -> dict[str, float]:
         """P(situation | memory) by name, of the first robot; of what the agent believes now, or of a state.

@@ -58,7 +58,7 @@ class JointTraining:
         ]
         optimizer = torch.optim.Adam(groups, foreach=True)
         schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda done: min(1.0, 2.0 * (1.0 - done / self.iterations))
+            optimizer, lambda done: min(1.0, 2.0 * (1.0 - done / max(1, self.iterations)))
         )
         theta, member = dict(model.theta.items()), torch.arange(model.members, device=data.x.device)[:, None]
         for _ in range(self.iterations):

@@ -67,7 +67,7 @@ class MAML:
         self._check(model, data, inner_loop)
         n_situations = len(data.x)
         meta_batch_size = min(self.meta_batch_size, n_situations)
-        h = model.embeddings.detach().expand(meta_batch_size, -1)
+        h = model.embeddings.detach()[:, 0].expand(meta_batch_size, -1)
         optimizer = torch.optim.Adam(model.theta.parameters(), lr=self.meta_lr, foreach=True)
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda done: 1.0 - done / self.iterations)
         for iteration in range(self.iterations):

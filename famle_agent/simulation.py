@@ -230,7 +230,7 @@ class SimulationLearner(BaseAlgorithm):
         given = envs if isinstance(envs, Transitions) else None
         sources = None if isinstance(envs, Transitions) else situation_envs(self._require_env(), envs)
         rounds = 0 if given is not None else self.hyperparameters.rounds
-        run = None if folder is None else RunFolder(folder, self._fingerprint(sources))
+        run = None if folder is None else RunFolder(folder, self._fingerprint(sources, given))
         if not self._custom_logger:
             name = tb_log_name or f"{type(self).__name__}_meta"
             self._logger = configure_logger(self.verbose, self.tensorboard_log, name)
@@ -238,6 +238,8 @@ class SimulationLearner(BaseAlgorithm):
         total_timesteps = self.hyperparameters.iterations(rounds)  # the name that callbacks look for
         self.num_timesteps = 0
         self.forget()
+        if run is not None and self.seed is not None:
+            self._generator.manual_seed(self.seed)  # the same call draws the same numbers, be it the first or not
         hooks.on_training_start(locals(), globals())
         transitions, going_on = None, True
         for round_ in range(rounds + 1):
@@ -312,16 +314,26 @@ class SimulationLearner(BaseAlgorithm):
         """What makes the agent plan with what it has learnt so far."""
         model, reward_fn = deepcopy(self._require_dynamics()).cpu(), self._reward_fn
         if reward_fn is None and self._learned_reward is not None:
-            reward_fn = deepcopy(self._learned_reward).cpu()
+            learned, scale = (
+                deepcopy(self._learned_reward).cpu(),
+                ActionScale.of(self.action_space, torch.device("cpu")),
+            )
+
+            def reward_fn(obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
+                return learned(obs, scale.to_unit(action), next_obs)  # type: ignore[no-any-return]
+
         return make_planning(model, self.hyperparameters.make_planner(), reward_fn)
 
-    def _fingerprint(self, sources: tuple[list[EnvSource], list[str]] | None) -> dict[str, Any]:
+    def _fingerprint(
+        self, sources: tuple[list[EnvSource], list[str]] | None, given: Transitions | None
+    ) -> dict[str, Any]:
         """What two runs must have in common for one to go on where the other stopped."""
         return {
             "agent": type(self).__name__,
             "env": self._env_spec,
             "seed": self.seed,
             "situations": None if sources is None else sources[1],
+            "transitions": None if given is None else given.digest(),
             "hyperparameters": self.hyperparameters.to_dict(),
         }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import zipfile
 import zlib
@@ -70,6 +71,13 @@ class Transitions:
         names = ("obs", "action", "reward", "next_obs")
         arrays = {name: np.concatenate([getattr(self, name), getattr(others, name)], axis=1) for name in names}
         return Transitions(**arrays, situations=self.situations)
+
+    def digest(self) -> str:
+        """A short text that other transitions do not share."""
+        digest = hashlib.sha256(repr(self.situations).encode())
+        for values in (self.obs, self.action, self.reward, self.next_obs):
+            digest.update(np.ascontiguousarray(values).tobytes())
+        return digest.hexdigest()[:16]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a compressed NumPy archive; an older file stays whole until the new one is complete."""

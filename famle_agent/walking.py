@@ -45,15 +45,15 @@ class BrokenRun:
     frames: Frames = field(default_factory=list)
 
     def recovery(self, threshold: float, window: int = 100) -> int | None:
-        """Steps from the break until the mean speed over the last ``window`` steps is above the threshold for good.
+        """Steps from the break until the mean speed over the last ``window`` steps is above the threshold again.
 
-        0 where it never falls to it; None where it stays below to the end.
+        0 where it never falls to the threshold; None where it does not come back.
         """
-        below = np.flatnonzero(running_mean(self.speed, window)[self.break_at :] <= threshold)
-        if len(below) == 0:
+        above = running_mean(self.speed, window)[self.break_at :] > threshold
+        if above.all():
             return 0
-        last = int(below[-1]) + 1
-        return last if last < len(self.speed) - self.break_at else None
+        again = np.flatnonzero(above & (np.cumsum(~above) > 0))
+        return int(again[0]) + 1 if len(again) else None
 
 
 def run_and_break(

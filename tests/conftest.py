@@ -102,6 +102,7 @@ def make_env() -> Iterator[Callable[..., gym.Env[Any, Any]]]:
 def tiny_budgets(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shrinks what an agent spends by default, and the reacher's episodes."""
     tiny = {**QUICK, "transitions_per_situation": 40, "meta_iterations": 3, "inner_steps": 3}
+    tiny |= {"rounds": 0, "joint_iterations": 2}
     for robot in known_robots().values():
         for mode in robot.modes.values():
             for name, value in tiny.items():

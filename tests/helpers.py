@@ -1,14 +1,21 @@
-"""What several tests of the agent share."""
+"""What several tests share."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
+import torch
+from hypothesis import strategies as st
+from torch import Tensor
 
 from famle_agent import FAMLE, OnlineState, Transitions
+from famle_agent.adaptation import Belief, Candidates, Memory, adapt, prior, window_posterior
+from famle_agent.dynamics import Dynamics, Theta
+from famle_agent.inner_loop import InnerLoop
 
 Array = npt.NDArray[Any]
 
@@ -29,3 +36,70 @@ def run(agent: FAMLE, env: gym.Env[Any, Any], steps: int, seed: int = 0) -> Onli
             obs, _ = env.reset()
     assert state is not None
     return state
+
+
+# --- models -------------------------------------------------------------------------------------------------
+
+
+@st.composite
+def models(draw: st.DrawFn) -> Dynamics:
+    """Models of many shapes, with a normalisation that is not the identity."""
+    obs_dim, action_dim, members = draw(st.integers(1, 6)), draw(st.integers(1, 3)), draw(st.integers(1, 3))
+    dims = draw(st.permutations(range(obs_dim)))
+    quaternion_dims = dims[:4] if obs_dim >= 4 and draw(st.booleans()) else []
+    others = dims[len(quaternion_dims) :]
+    torch.manual_seed(draw(st.integers(0, 1000)))
+    model = Dynamics(
+        obs_dim,
+        action_dim,
+        n_situations=draw(st.integers(1, 5)),
+        embedding_dim=draw(st.integers(1, 4)),
+        hidden=draw(st.lists(st.integers(1, 9), min_size=1, max_size=3)),
+        angle_dims=others[: draw(st.integers(0, len(others)))],
+        quaternion_dims=quaternion_dims,
+        gate_actions=draw(st.booleans()),
+        interaction_rank=draw(st.integers(0, 3)),
+        members=members,
+        degrees_of_freedom=draw(st.sampled_from([0.0, 3.0])),
+    )
+    model.fit_normalisation(3 + 2 * torch.randn(50, obs_dim), 3 + 2 * torch.randn(50, obs_dim))
+    model.noise_std.copy_(torch.rand(members, obs_dim) + 0.5)
+    return model
+
+
+def simple_model(**kwargs: Any) -> Dynamics:
+    torch.manual_seed(0)
+    return Dynamics(**{"obs_dim": 3, "action_dim": 2, "n_situations": 4, "hidden": (8, 8), **kwargs})
+
+
+def random_theta(model: Dynamics, size: int) -> Theta:
+    """Parameters of every member for each of ``size`` robots."""
+    rows = size * model.members
+    return {name: torch.randn(rows, *value.shape[1:]) for name, value in model.parameters_by_name().items()}
+
+
+def random_h(model: Dynamics, size: int) -> Tensor:
+    return torch.randn(size * model.members, model.embeddings.shape[-1])
+
+
+def random_transitions(model: Dynamics, *shape: int) -> tuple[Tensor, Tensor, Tensor]:
+    obs = torch.randn(*shape, model.obs_dim)
+    return obs, torch.rand(*shape, model.action_dim) * 2 - 1, obs + 0.3 * torch.randn_like(obs)
+
+
+def rows_of(theta: Theta, rows: slice) -> Theta:
+    return {name: value[rows] for name, value in theta.items()}
+
+
+def memory_of(model: Dynamics, candidates: Candidates, obs: Tensor, action: Tensor, next_obs: Tensor) -> Memory:
+    """A memory full of the transitions of B robots, (B, M, ...)."""
+    log_p = candidates.log_likelihood(model, model.encode(obs, action, next_obs))
+    return Memory(obs, action, next_obs, log_p, torch.ones(obs.shape[:2]))
+
+
+def adapted(model: Dynamics, candidates: Candidates, memory: Memory, inner_loop: InnerLoop) -> Belief:
+    """Algorithm 2, lines 6 and 7, for robots that have seen nothing but their memory."""
+    start = prior(model, candidates, len(memory.weight))
+    return adapt(
+        model, candidates, memory, inner_loop, replace(start, log_posterior=window_posterior(candidates, memory))
+    )

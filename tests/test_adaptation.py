@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from famle_agent import FAMLE, Transitions
-from famle_agent.adaptation import Belief, Memory, adapt, prior, situation_log_likelihood
-from famle_agent.dynamics import Dynamics, expand
+from famle_agent.adaptation import Belief, Candidates, Memory, adapt, prior
+from famle_agent.dynamics import Dynamics
 from famle_agent.inner_loop import InnerLoop
+from tests.helpers import adapted, memory_of
 
 INNER_LOOP = InnerLoop(steps=10, lr=1e-3, embedding_lr=0.05, optimizer="adam")
 CPU = torch.device("cpu")
@@ -37,17 +38,19 @@ def model(agent_file: str) -> Iterator[Dynamics]:
     agent.get_env().close()
 
 
-def memory_of(transitions: Transitions, rows: slice = slice(None)) -> Memory:
-    """One robot per situation, with all of its transitions in its memory."""
-    obs, action, next_obs = (
-        torch.from_numpy(getattr(transitions, name)[rows]) for name in ("obs", "action", "next_obs")
-    )
-    return Memory(obs, action, next_obs, torch.ones(obs.shape[:2]))
+@pytest.fixture(scope="module")
+def candidates(model: Dynamics) -> Candidates:
+    return Candidates.of(model, compose=False)
 
 
-def transition(value: float, robots: int) -> tuple[Tensor, Tensor, Tensor]:
+def tensors_of(transitions: Transitions, rows: slice = slice(None)) -> list[Tensor]:
+    """One robot per situation, with all of its transitions."""
+    return [torch.from_numpy(getattr(transitions, name)[rows]) for name in ("obs", "action", "next_obs")]
+
+
+def transition(value: float, robots: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     one = torch.full((robots, 1), value)
-    return one, one + 0.1, one + 0.2
+    return one, one + 0.1, one + 0.2, torch.cat([one + 0.3, one + 0.4], dim=1)
 
 
 # --- the memory -------------------------------------------------------------------------------------------
@@ -61,7 +64,7 @@ def transition(value: float, robots: int) -> tuple[Tensor, Tensor, Tensor]:
 )
 def test_memory_keeps_the_last_transitions_in_order(size: int, valid: list[list[bool]]) -> None:
     robots = len(valid[0]) if valid else 1
-    memory = Memory.empty(robots, size, obs_dim=1, action_dim=1, device=CPU)
+    memory = Memory.empty(robots, size, obs_dim=1, action_dim=1, candidates=2, device=CPU)
     expected: list[deque[float]] = [deque(maxlen=size) for _ in range(robots)]
     for step, flags in enumerate(valid, start=1):
         memory = memory.add(*transition(float(step), robots), torch.tensor(flags))
@@ -75,84 +78,88 @@ def test_memory_keeps_the_last_transitions_in_order(size: int, valid: list[list[
         torch.testing.assert_close(memory.obs[robot, filled, 0], obs)
         torch.testing.assert_close(memory.action[robot, filled, 0], obs + 0.1)
         torch.testing.assert_close(memory.next_obs[robot, filled, 0], obs + 0.2)
+        torch.testing.assert_close(memory.log_p[robot, filled], torch.stack([obs + 0.3, obs + 0.4], dim=1))
 
 
 def test_adding_leaves_the_old_memory_as_it_is() -> None:
-    memory = Memory.empty(1, 3, 1, 1, CPU)
+    memory = Memory.empty(1, 3, 1, 1, 2, CPU)
     memory.add(*transition(1.0, 1), torch.tensor([True]))
     assert memory.weight.sum() == 0
     assert memory.obs.sum() == 0
+    assert memory.log_p.sum() == 0
 
 
 # --- the most likely situation ----------------------------------------------------------------------------
 
 
-def test_embedding_of_the_situation_is_found(model: Dynamics, held_out: Transitions) -> None:
-    belief = adapt(model, memory_of(held_out), INNER_LOOP, prior(model, 11))
+def test_embedding_of_the_situation_is_found(model: Dynamics, candidates: Candidates, held_out: Transitions) -> None:
+    belief = adapted(model, candidates, memory_of(model, candidates, *tensors_of(held_out)), INNER_LOOP)
     assert belief.posterior.argmax(dim=1).tolist() == list(range(11))
     assert belief.posterior.amax(dim=1).min() > 0.9
     assert belief.adaptations == 1
 
 
-def test_likelihood_of_each_embedding_is_that_of_its_network(model: Dynamics, held_out: Transitions) -> None:
-    memory = memory_of(held_out)
-    data = model.encode(memory.obs, memory.action, memory.next_obs, memory.weight)
-    together = situation_log_likelihood(model, data)
-    assert together.shape == (11, 11)
-    theta = expand(model.parameters_by_name(), 11)
-    for situation in range(11):
-        h = model.embeddings[situation].expand(11, -1)
-        torch.testing.assert_close(
-            together[:, situation], model.log_likelihood(theta, h, data).sum(dim=1), rtol=1e-4, atol=0.1
-        )
-
-
-def test_adaptation_lowers_the_loss(model: Dynamics, held_out: Transitions) -> None:
-    memory = memory_of(held_out)
-    memory = replace(memory, action=memory.action * torch.tensor([-0.5, 1.0, 1.0, 0.0, 1.0]))  # no training situation
-    data = model.encode(memory.obs, memory.action, memory.next_obs)
-    start = prior(model, 11)
-    selected = adapt(model, memory, replace(INNER_LOOP, steps=0), start)
-    adapted = adapt(model, memory, INNER_LOOP, start)
-    losses = [model.loss(belief.theta, belief.h, data) for belief in (start, selected, adapted)]
+def test_adaptation_lowers_the_loss(model: Dynamics, candidates: Candidates, held_out: Transitions) -> None:
+    obs, action, next_obs = tensors_of(held_out)
+    action = action * torch.tensor([-0.5, 1.0, 1.0, 0.0, 1.0])  # no training situation
+    memory, data = memory_of(model, candidates, obs, action, next_obs), model.encode(obs, action, next_obs)
+    start, loops = prior(model, candidates, 11), (replace(INNER_LOOP, steps=0), INNER_LOOP)
+    selected, after = (adapted(model, candidates, memory, loop) for loop in loops)
+    losses = [model.loss(belief.theta, belief.h, data) for belief in (start, selected, after)]
     assert losses[1].mean() < losses[0].mean()
     assert (losses[2] < losses[1]).all()
-    assert torch.equal(selected.h, model.embeddings[selected.posterior.argmax(dim=1)])
+    likely = model.embeddings[0, selected.posterior.argmax(dim=1)].detach()
+    torch.testing.assert_close(selected.h, likely, rtol=0, atol=1e-5)
 
 
-def test_robots_adapt_as_they_would_alone(model: Dynamics, held_out: Transitions) -> None:
-    together = adapt(model, memory_of(held_out), INNER_LOOP, prior(model, 11))
+def test_robots_adapt_as_they_would_alone(model: Dynamics, candidates: Candidates, held_out: Transitions) -> None:
+    together = adapted(model, candidates, memory_of(model, candidates, *tensors_of(held_out)), INNER_LOOP)
     for robot in (0, 4, 10):
         rows = slice(robot, robot + 1)
-        alone = adapt(model, memory_of(held_out, rows), INNER_LOOP, prior(model, 1))
+        alone = adapted(model, candidates, memory_of(model, candidates, *tensors_of(held_out, rows)), INNER_LOOP)
         torch.testing.assert_close(alone.h, together.h[rows], rtol=1e-3, atol=1e-3)
-        torch.testing.assert_close(alone.log_likelihood, together.log_likelihood[rows], rtol=1e-3, atol=0.1)
+        torch.testing.assert_close(alone.log_posterior, together.log_posterior[rows], rtol=1e-3, atol=0.1)
         for name, value in alone.theta.items():
             torch.testing.assert_close(value, together.theta[name][rows], rtol=1e-3, atol=1e-3)
 
 
-def test_adaptation_starts_from_what_was_meta_learned(model: Dynamics, held_out: Transitions) -> None:
-    memory = memory_of(held_out)
-    once = adapt(model, memory, INNER_LOOP, prior(model, 11))
-    twice = adapt(model, memory, INNER_LOOP, once)
+def test_adaptation_starts_from_what_was_meta_learned(
+    model: Dynamics, candidates: Candidates, held_out: Transitions
+) -> None:
+    memory = memory_of(model, candidates, *tensors_of(held_out))
+    once = adapted(model, candidates, memory, INNER_LOOP)
+    twice = adapt(model, candidates, memory, INNER_LOOP, once)
     assert torch.equal(once.h, twice.h)
     assert all(torch.equal(value, twice.theta[name]) for name, value in once.theta.items())
     assert twice.adaptations == 2
 
 
-def test_empty_memory_says_nothing(model: Dynamics) -> None:
-    start = prior(model, 2)
-    belief = adapt(model, Memory.empty(2, 5, 12, 5, CPU), INNER_LOOP, start)
+def test_empty_memory_says_nothing(model: Dynamics, candidates: Candidates) -> None:
+    start = prior(model, candidates, 2)
+    belief = adapted(model, candidates, Memory.empty(2, 5, 12, 5, 11, CPU), INNER_LOOP)
     torch.testing.assert_close(belief.posterior, torch.full((2, 11), 1 / 11))
     assert torch.equal(belief.h, start.h)
     torch.testing.assert_close(belief.theta["weight_0"], start.theta["weight_0"])
 
 
+def test_places_that_are_empty_do_not_count(model: Dynamics, candidates: Candidates, held_out: Transitions) -> None:
+    """Whatever stands there: neither in the posterior nor in the gradient."""
+    full = memory_of(model, candidates, *tensors_of(held_out, slice(3, 4)))
+    part = memory_of(model, candidates, *(values[:, 30:] for values in tensors_of(held_out, slice(3, 4))))
+    padded = replace(full, weight=(torch.arange(40) >= 30).float()[None])
+    one, other = (adapted(model, candidates, memory, INNER_LOOP) for memory in (part, padded))
+    torch.testing.assert_close(one.log_posterior, other.log_posterior)
+    torch.testing.assert_close(one.h, other.h, rtol=1e-3, atol=1e-4)
+
+
 @pytest.mark.parametrize("error", [1.0, 1e3, 1e6, 1e12, 1e20])
-def test_terrible_fit_leaves_a_posterior(model: Dynamics, held_out: Transitions, error: float) -> None:
-    memory = memory_of(held_out)
-    noise = torch.from_numpy(np.random.default_rng(0).normal(size=memory.obs.shape).astype(np.float32))
-    belief = adapt(model, replace(memory, next_obs=memory.obs + error * noise), INNER_LOOP, prior(model, 11))
+def test_terrible_fit_leaves_a_posterior(
+    model: Dynamics, candidates: Candidates, held_out: Transitions, error: float
+) -> None:
+    obs, action, _ = tensors_of(held_out)
+    noise = torch.from_numpy(np.random.default_rng(0).normal(size=obs.shape).astype(np.float32))
+    memory = memory_of(model, candidates, obs, action, obs + error * noise)
+    belief = adapted(model, candidates, memory, INNER_LOOP)
     assert belief.posterior.isfinite().all()
     torch.testing.assert_close(belief.posterior.sum(dim=1), torch.ones(11))
     assert belief.h.isfinite().all()
@@ -161,22 +168,33 @@ def test_terrible_fit_leaves_a_posterior(model: Dynamics, held_out: Transitions,
 # --- beliefs ----------------------------------------------------------------------------------------------
 
 
-def test_prior_is_the_first_situation_and_all_are_as_likely(model: Dynamics) -> None:
-    belief = prior(model, 3)
-    assert torch.equal(belief.h, model.embeddings[:1].expand(3, -1))
+def test_prior_is_the_first_situation_and_all_are_as_likely(model: Dynamics, candidates: Candidates) -> None:
+    belief = prior(model, candidates, 3)
+    assert torch.equal(belief.h, model.embeddings[:, 0].expand(3, -1))
     torch.testing.assert_close(belief.posterior, torch.full((3, 11), 1 / 11))
     assert belief.adaptations == 0
 
 
-def make_belief(value: float, adaptations: int) -> Belief:
-    theta = {"weight_0": torch.full((3, 2, 2), value), "bias_0": torch.full((3, 2), value)}
-    return Belief(theta, torch.full((3, 4), value), torch.full((3, 5), value), adaptations)
+def make_belief(value: float, adaptations: int, members: int = 1) -> Belief:
+    rows = 3 * members
+    theta = {"weight_0": torch.full((rows, 2, 2), value), "bias_0": torch.full((rows, 2), value)}
+    return Belief(theta, torch.full((rows, 4), value), torch.full((3, 5), value), adaptations)
 
 
-@given(st.lists(st.booleans(), min_size=3, max_size=3))
-def test_beliefs_are_mixed_by_robot(kept: list[bool]) -> None:
-    mixed = make_belief(1.0, adaptations=4).where(torch.tensor(kept), make_belief(2.0, adaptations=0))
+@given(st.lists(st.booleans(), min_size=3, max_size=3), st.integers(1, 3))
+def test_beliefs_are_mixed_by_robot(kept: list[bool], members: int) -> None:
+    mixed = make_belief(1.0, 4, members).where(torch.tensor(kept), make_belief(2.0, 0, members))
     expected = [1.0 if keep else 2.0 for keep in kept]
-    for value in (*mixed.theta.values(), mixed.h, mixed.log_likelihood):
-        assert value.flatten(1).amax(dim=1).tolist() == value.flatten(1).amin(dim=1).tolist() == expected
+    for value in (*mixed.theta.values(), mixed.h, mixed.log_posterior):
+        rows = [number for number in expected for _ in range(len(value) // 3)]
+        assert value.flatten(1).amax(dim=1).tolist() == value.flatten(1).amin(dim=1).tolist() == rows
     assert mixed.adaptations == 4
+
+
+@pytest.mark.parametrize("part", ["theta", "h"])
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_one_member_that_is_not_finite_spoils_its_robot(part: str, bad: float) -> None:
+    belief = make_belief(1.0, adaptations=1, members=2)
+    assert belief.is_finite().tolist() == [True, True, True]
+    (belief.h if part == "h" else belief.theta["bias_0"])[3, 1] = bad
+    assert belief.is_finite().tolist() == [True, False, True]

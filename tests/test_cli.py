@@ -3,6 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -54,7 +55,8 @@ def test_demo_gives_its_episodes(tmp_path: Path) -> None:
 
 def test_meta_learned_agent_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "arm.zip"
-    main(["meta-learn", "--robot", "reacher", "--out", str(path), "--tensorboard", str(tmp_path / "tb"), "--seed", "3"])
+    args = ["--tensorboard", str(tmp_path / "tb"), "--seed", "3", "--jobs", "1"]
+    main(["meta-learn", "--robot", "reacher", "--out", str(path), *args])
     assert path.exists()
     assert (tmp_path / "tb" / "FAMLE_meta_1").is_dir()
     shown = []
@@ -66,6 +68,23 @@ def test_meta_learned_agent_runs(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "episode 1: return" in shown[0]
     assert "believes joint" in shown[0] or "believes intact" in shown[0]
     assert shown[0] == shown[1]  # the same seed
+
+
+def test_meta_learning_goes_on_in_its_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["meta-learn", "--jobs", "1", "--folder", str(tmp_path / "run"), "--out"]
+    main([*command, str(tmp_path / "one.zip")])
+    stored = (tmp_path / "run" / "round-0.zip").read_bytes()
+    main([*command, str(tmp_path / "again.zip")])
+    assert (tmp_path / "run" / "round-0.zip").read_bytes() == stored
+    one, again = (FAMLE.load(tmp_path / f"{name}.zip", device="cpu") for name in ("one", "again"))
+    assert torch.equal(one.dynamics.embeddings, again.dynamics.embeddings)
+    for agent in (one, again):
+        agent.get_env().close()
+    with pytest.raises(SystemExit) as caught:
+        main([*command, str(tmp_path / "other.zip"), "--seed", "1"])
+    assert caught.value.code == 2
+    assert "differs in: seed" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "other.zip").exists()
 
 
 @pytest.mark.parametrize(

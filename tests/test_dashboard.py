@@ -27,14 +27,21 @@ def pictures(n: int) -> list[np.ndarray]:
 
 def test_meta_learning_shows_its_losses_and_the_map_of_the_situations(transitions: Transitions, tmp_path: Path) -> None:
     agent = FAMLE(
-        "reacher", seed=0, device="cpu", meta_iterations=5, inner_steps=2, tensorboard_log=str(tmp_path / "tb")
+        "reacher",
+        seed=0,
+        device="cpu",
+        joint_iterations=3,
+        meta_iterations=5,
+        inner_steps=2,
+        tensorboard_log=str(tmp_path / "tb"),
     )
     agent.get_env().close()
     agent.meta_learn(transitions)
     folder = tmp_path / "tb" / "FAMLE_meta_1"
     events = read(folder)
     for key in ("meta/loss_before", "meta/loss_after"):
-        assert [event.step for event in events.Scalars(key)] == [1, 2, 3, 4, 5]
+        assert [event.step for event in events.Scalars(key)] == [4, 5, 6, 7, 8]
+    assert [event.step for event in events.Scalars("meta/joint_loss")] == [1, 2, 3]
     assert all(np.isfinite(event.value) for event in events.Scalars("meta/loss_after"))
     assert "situations" in (folder / "projector_config.pbtxt").read_text()
     names = next(folder.rglob("metadata.tsv")).read_text().splitlines()
@@ -42,15 +49,22 @@ def test_meta_learning_shows_its_losses_and_the_map_of_the_situations(transition
     assert len(next(folder.rglob("tensors.tsv")).read_text().splitlines()) == 11
 
 
-def test_life_shows_returns_and_the_posterior(load_agent: Callable[..., FAMLE], tmp_path: Path) -> None:
-    agent = load_agent(adapt_every=10, adapt_steps=1, candidates=5, planner_iterations=1, tensorboard_log=str(tmp_path))
+@pytest.mark.parametrize(("compose", "total"), [(False, 1.0), (True, 1.5)])
+def test_life_shows_returns_and_the_posterior(
+    load_agent: Callable[..., FAMLE], tmp_path: Path, compose: bool, total: float
+) -> None:
+    """Of each situation, alone or as one of two: then all of them are likely once or twice."""
+    settings = {"adapt_every": 10, "adapt_steps": 1, "candidates": 5, "planner_iterations": 1, "compose": compose}
+    agent = load_agent(**settings, tensorboard_log=str(tmp_path))
     agent.learn(110, tb_log_name="life")
     events = read(tmp_path / "life_1")
     assert [event.step for event in events.Scalars("rollout/ep_rew_mean")] == [50, 100]
     assert all(0 < event.value <= 50 for event in events.Scalars("rollout/ep_rew_mean"))
     names = [tag for tag in events.Tags()["scalars"] if tag.startswith("posterior/")]
     assert set(names) == {f"posterior/{name}" for name in agent.situations}
-    assert sum(events.Scalars(name)[-1].value for name in names) == pytest.approx(1.0, abs=1e-4)
+    assert sum(events.Scalars(name)[-1].value for name in names) == pytest.approx(
+        total, abs=1e-4 if not compose else 0.5
+    )
 
 
 def test_log_interval_counts_episodes(load_agent: Callable[..., FAMLE], tmp_path: Path) -> None:

@@ -1,99 +1,145 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 (torch's own custom)
 
-from famle_agent.dynamics import Batch, Dynamics, Theta, expand
-
-
-@st.composite
-def models(draw: st.DrawFn) -> Dynamics:
-    """Models of many shapes, with a normalisation that is not the identity."""
-    obs_dim, action_dim = draw(st.integers(1, 4)), draw(st.integers(1, 3))
-    torch.manual_seed(draw(st.integers(0, 1000)))
-    model = Dynamics(
-        obs_dim,
-        action_dim,
-        n_situations=draw(st.integers(1, 5)),
-        embedding_dim=draw(st.integers(1, 4)),
-        hidden=draw(st.lists(st.integers(1, 9), min_size=1, max_size=3)),
-        angle_dims=draw(st.lists(st.integers(0, obs_dim - 1), unique=True)),
-        gate_actions=draw(st.booleans()),
-    )
-    model.fit_normalisation(3 + 2 * torch.randn(50, obs_dim), 3 + 2 * torch.randn(50, obs_dim))
-    model.noise_std.copy_(torch.rand(obs_dim) + 0.5)
-    return model
-
-
-def random_theta(model: Dynamics, size: int) -> Theta:
-    return {name: torch.randn(size, *value.shape) for name, value in model.parameters_by_name().items()}
-
-
-def random_transitions(model: Dynamics, *shape: int) -> tuple[Tensor, Tensor, Tensor]:
-    obs = torch.randn(*shape, model.obs_dim)
-    return obs, torch.rand(*shape, model.action_dim) * 2 - 1, obs + 0.3 * torch.randn_like(obs)
-
-
-def simple_model(**kwargs: Any) -> Dynamics:
-    torch.manual_seed(0)
-    return Dynamics(**{"obs_dim": 3, "action_dim": 2, "n_situations": 4, "hidden": (8, 8), **kwargs})
-
-
-def of(theta: Theta, i: int) -> Theta:
-    return {name: value[i : i + 1] for name, value in theta.items()}
-
+from famle_agent.dynamics import Dynamics, expand
+from tests.helpers import models, random_h, random_theta, random_transitions, rows_of, simple_model
 
 # --- one code path for one and for many -----------------------------------------------------------------
 
 
 @given(models(), st.integers(1, 4), st.integers(1, 6))
 def test_networks_in_a_batch_equal_each_alone(model: Dynamics, size: int, n: int) -> None:
-    theta, h = random_theta(model, size), torch.randn(size, model.embeddings.shape[1])
-    obs, action, next_obs = random_transitions(model, size, n)
-    weight = (torch.rand(size, n) > 0.3).float()
+    theta, h, P = random_theta(model, size), random_h(model, size), model.members
+    obs, action, next_obs = random_transitions(model, size * P, n)
+    weight = (torch.rand(size * P, n) > 0.3).float()
     data = model.encode(obs, action, next_obs, weight)
     loss, density = model.loss(theta, h, data), model.log_likelihood(theta, h, data)
     predicted = model.simulator(theta, h)(obs, action)
-    assert loss.shape == (size,)
-    assert density.shape == (size, n)
+    assert loss.shape == (size * P,)
+    assert density.shape == (size * P, n)
     for i in range(size):
-        row = slice(i, i + 1)
-        alone = model.encode(obs[row], action[row], next_obs[row], weight[row])
-        torch.testing.assert_close(model.loss(of(theta, i), h[row], alone), loss[row])
-        torch.testing.assert_close(model.log_likelihood(of(theta, i), h[row], alone), density[row])
-        torch.testing.assert_close(model.simulator(of(theta, i), h[row])(obs[row], action[row]), predicted[row])
+        rows = slice(i * P, (i + 1) * P)  # all members of one robot: each has a noise of its own
+        alone = model.encode(obs[rows], action[rows], next_obs[rows], weight[rows])
+        one = rows_of(theta, rows)
+        torch.testing.assert_close(model.loss(one, h[rows], alone), loss[rows])
+        torch.testing.assert_close(model.log_likelihood(one, h[rows], alone), density[rows], rtol=1e-5, atol=1e-4)
+        torch.testing.assert_close(model.simulator(one, h[rows])(obs[rows], action[rows]), predicted[rows])
 
 
-@given(models(), st.integers(1, 4), st.integers(1, 6))
-def test_simulator_predicts_what_the_network_does(model: Dynamics, size: int, n: int) -> None:
-    theta, h = random_theta(model, size), torch.randn(size, model.embeddings.shape[1])
-    obs, action, next_obs = random_transitions(model, size, n)
+@pytest.mark.parametrize("members", [1, 3])
+@pytest.mark.parametrize("quaternion_dims", [(), (1, 2, 3, 5)])
+@pytest.mark.parametrize("interaction_rank", [0, 2])
+@pytest.mark.parametrize("gate_actions", [False, True])
+def test_folded_network_equals_prediction_with_the_same_embedding(
+    gate_actions: bool, interaction_rank: int, quaternion_dims: tuple[int, ...], members: int
+) -> None:
+    model = simple_model(
+        obs_dim=6,
+        angle_dims=(4,),
+        quaternion_dims=quaternion_dims,
+        gate_actions=gate_actions,
+        interaction_rank=interaction_rank,
+        members=members,
+    ).double()
+    obs, action, next_obs = (values.double() for values in random_transitions(model, 2 * members, 5))
+    model.fit_normalisation(3 + 2 * obs, 1 + 3 * next_obs)
     data = model.encode(obs, action, next_obs)
-    change = model.forward(model.network(theta, h), data.x) * model.target_std + model.target_mean
-    torch.testing.assert_close(model.simulator(theta, h)(obs, action), obs + change, rtol=1e-4, atol=1e-4)
+    theta, h = {name: value.double() for name, value in random_theta(model, 2).items()}, random_h(model, 2).double()
+    folded = model.forward(model.network(theta, h), data.x)
+    torch.testing.assert_close(model.predict(theta, h[:, None], data.x), folded)
+    torch.testing.assert_close(model.predict(theta, h[:, None].expand(-1, 5, -1), data.x), folded)
+    expected = obs + folded * model.target_std + model.target_mean
+    torch.testing.assert_close(model.simulator(theta, h)(obs, action), expected)
+    unlike = model.forward(model.network(theta, h + 0.1), data.x)
+    assert (unlike - folded).abs().amin(dim=(1, 2)).max() > 0  # the embedding matters
+
+
+@given(models(), st.integers(1, 3), st.integers(2, 6))
+def test_each_row_may_have_an_embedding_of_its_own(model: Dynamics, size: int, n: int) -> None:
+    theta, x = random_theta(model, size), torch.randn(size * model.members, n, model.n_features + model.action_dim)
+    h = torch.randn(len(x), n, model.embeddings.shape[-1])
+    together = model.predict(theta, h, x)
+    for row in range(n):
+        alone = model.predict(theta, h[:, row : row + 1], x[:, row : row + 1])
+        torch.testing.assert_close(together[:, row : row + 1], alone, rtol=1e-4, atol=1e-4)
 
 
 @given(models(), st.integers(1, 3))
 def test_rollouts_of_candidates_are_independent(model: Dynamics, size: int) -> None:
-    theta, h = random_theta(model, size), torch.randn(size, model.embeddings.shape[1])
-    obs, action, _ = random_transitions(model, size, 5)
+    theta, h = random_theta(model, size), random_h(model, size)
+    obs, action, _ = random_transitions(model, size * model.members, 5)
     simulator = model.simulator(theta, h)
     torch.testing.assert_close(simulator(obs, action)[:, 2:3], simulator(obs[:, 2:3], action[:, 2:3]))
+
+
+# --- members of an ensemble -------------------------------------------------------------------------------
 
 
 def test_expand_shows_the_same_parameters_often() -> None:
     theta = simple_model().parameters_by_name()
     for name, value in expand(theta, 3).items():
-        assert value.shape == (3, *theta[name].shape)
+        assert value.shape == (3, *theta[name].shape[1:])
         assert value.data_ptr() == theta[name].data_ptr()
         assert not value.requires_grad
+
+
+@given(models(), st.integers(1, 4))
+def test_expand_gives_each_robot_all_members(model: Dynamics, size: int) -> None:
+    theta, P = model.parameters_by_name(), model.members
+    for name, value in expand(theta, size).items():
+        assert value.shape == (size * P, *theta[name].shape[1:])
+        for robot in range(size):
+            assert torch.equal(value[robot * P : (robot + 1) * P], theta[name])
+
+
+def test_members_are_independent_networks() -> None:
+    model = simple_model(members=3, interaction_rank=2)
+    theta, h = model.parameters_by_name(), model.embeddings_of(torch.tensor([1]))
+    obs, action, next_obs = random_transitions(model, 1, 6)
+    data = model.encode(*(values.expand(3, -1, -1) for values in (obs, action, next_obs)))
+    before = model.loss(theta, h, data)
+    assert len(set(before.tolist())) == 3  # they begin differently
+    for name in theta:
+        changed = {key: value.clone() for key, value in theta.items()}
+        changed[name][1] += 0.1
+        after = model.loss(changed, h, data)
+        assert torch.equal(after[[0, 2]], before[[0, 2]])
+        assert after[1] != before[1]
+
+
+@given(models(), st.data())
+def test_part_of_an_ensemble_is_its_first_members(model: Dynamics, data: st.DataObject) -> None:
+    count = data.draw(st.integers(1, model.members))
+    part = model.with_members(count)
+    assert part.members == count
+    h, batch = torch.randn(count, model.embeddings.shape[-1]), model.encode(*random_transitions(model, count, 4))
+    whole = expand(rows_of(model.parameters_by_name(), slice(0, count)), 1)
+    torch.testing.assert_close(part.loss(part.parameters_by_name(), h, batch), model.loss(whole, h, batch))
+    assert torch.equal(part.embeddings, model.embeddings[:count])
+    assert torch.equal(part.noise_std, model.noise_std[:count])
+    with torch.no_grad():
+        part.embeddings.add_(1.0)
+    assert not torch.equal(part.embeddings, model.embeddings[:count])
+    for wrong in (0, model.members + 1):
+        with pytest.raises(ValueError, match=f"1 to {model.members} members"):
+            model.with_members(wrong)
+
+
+def test_embeddings_of_situations_are_ordered_by_robot() -> None:
+    model = simple_model(members=2)
+    h, c = model.embeddings_of(torch.tensor([3, 0, 3])), (3, 0, 3)
+    assert h.shape == (6, model.embeddings.shape[-1])
+    for robot in range(3):
+        for member in range(2):
+            assert torch.equal(h[2 * robot + member], model.embeddings[member, c[robot]])
+    assert not h.requires_grad
 
 
 # --- the model is the paper's -----------------------------------------------------------------------------
@@ -112,13 +158,14 @@ def test_embedding_is_concatenated_to_the_input() -> None:
 
 def test_paper_network_has_no_gate() -> None:
     assert "gate" not in simple_model(gate_actions=False).theta
-    assert simple_model(gate_actions=True).theta["gate"].shape == (5, 2)
+    assert simple_model(gate_actions=True).theta["gate"].shape == (1, 5, 2)
+    assert not [name for name in simple_model().theta if "interaction" in name]
 
 
 @pytest.mark.parametrize("gain", [-1.0, 0.0, 0.4])
 def test_gate_expresses_the_gain_of_each_motor(gain: float) -> None:
     model = simple_model(embedding_dim=2)
-    theta = expand(model.parameters_by_name(), 1)
+    theta = model.parameters_by_name()
     theta["embedding"] = torch.zeros_like(theta["embedding"])  # h acts through the gate alone
     theta["gate"] = torch.eye(2)[None]
     obs, action, _ = random_transitions(model, 1, 6)
@@ -127,61 +174,33 @@ def test_gate_expresses_the_gain_of_each_motor(gain: float) -> None:
     torch.testing.assert_close(broken, intact)
 
 
-def test_loss_is_half_the_mean_squared_error() -> None:
-    model = simple_model()
-    theta, h = expand(model.parameters_by_name(), 1), model.embeddings[:1]
-    data = model.encode(*random_transitions(model, 1, 9))
-    error = model.forward(model.network(theta, h), data.x) - data.y
-    torch.testing.assert_close(model.loss(theta, h, data), 0.5 * error.square().mean()[None])
+@pytest.mark.parametrize(("gate_actions", "interaction_rank", "acts"), [(True, 0, 1), (False, 3, 1), (True, 3, 0)])
+def test_faults_add_up_in_the_first_layer(gate_actions: bool, interaction_rank: int, acts: int) -> None:
+    """h_1 + h_2 does there what h_1 and h_2 do, each by itself; where both are linear, for observations at least."""
+    model = simple_model(gate_actions=gate_actions, interaction_rank=interaction_rank).double()
+    theta = {name: value.double() for name, value in random_theta(model, 1).items()}
+    intact, one, other = torch.randn(3, 1, model.embeddings.shape[-1], dtype=torch.float64)
+    x = torch.randn(1, 7, model.n_features + model.action_dim, dtype=torch.float64)
+    x[..., model.n_features :] *= acts
+
+    def effect(h: torch.Tensor) -> torch.Tensor:
+        (weight, bias), (intact_weight, intact_bias) = (model.network(theta, each)[0] for each in (h, intact))
+        return x @ (weight - intact_weight) + bias - intact_bias
+
+    torch.testing.assert_close(effect(one + other - intact), effect(one) + effect(other))
+    assert effect(one).std(dim=1).min() > 0.1  # more than a bias
 
 
-@given(models(), st.integers(1, 4))
-def test_log_likelihood_is_that_of_a_normal_distribution(model: Dynamics, n: int) -> None:
-    theta, h = random_theta(model, 2), torch.randn(2, model.embeddings.shape[1])
-    data = model.encode(*random_transitions(model, 2, n))
-    normal = torch.distributions.Normal(model.forward(model.network(theta, h), data.x), model.noise_std)
-    expected = normal.log_prob(data.y).sum(dim=-1)
-    torch.testing.assert_close(model.log_likelihood(theta, h, data), expected, rtol=1e-4, atol=1e-4)
-
-
-def test_fitted_noise_is_the_most_likely() -> None:
-    model = simple_model()
-    data = model.encode(*random_transitions(model, 4, 200))
-    model.fit_noise(data)
-    theta = expand(model.parameters_by_name(), 4)
-    best, fitted = model.log_likelihood(theta, model.embeddings, data).sum(), model.noise_std.clone()
-    for factor in (0.9, 1.1):
-        model.noise_std.copy_(factor * fitted)
-        assert model.log_likelihood(theta, model.embeddings, data).sum() < best
-
-
-def test_fitted_noise_of_an_exact_model_is_above_zero() -> None:
-    model = simple_model()
-    theta = expand(model.parameters_by_name(), 4)
-    x = torch.randn(4, 20, 5)
-    data = Batch(x, model.forward(model.network(theta, model.embeddings), x), torch.ones(4, 20))
-    model.fit_noise(data)
-    assert model.noise_std.min() > 0
-    assert model.log_likelihood(theta, model.embeddings, data).isfinite().all()
-
-
-@given(models(), st.integers(1, 5), st.integers(1, 5))
-def test_padding_changes_nothing(model: Dynamics, n: int, padding: int) -> None:
-    theta, h = random_theta(model, 2), torch.randn(2, model.embeddings.shape[1])
-    real, noise = random_transitions(model, 2, n), random_transitions(model, 2, padding)
-    weight = torch.cat([torch.ones(2, n), torch.zeros(2, padding)], dim=1)
-    padded = model.encode(*(torch.cat([a, b], dim=1) for a, b in zip(real, noise, strict=True)), weight)
-    data = model.encode(*real)
-    torch.testing.assert_close(model.loss(theta, h, padded), model.loss(theta, h, data))
-    density = model.log_likelihood(theta, h, padded)
-    torch.testing.assert_close(density[:, :n], model.log_likelihood(theta, h, data))
-    assert (density[:, n:] == 0).all()
-
-
-def test_nothing_but_padding_has_no_loss() -> None:
-    model = simple_model()
-    data = model.encode(*random_transitions(model, 1, 3), torch.zeros(1, 3))
-    assert model.loss(expand(model.parameters_by_name(), 1), model.embeddings[:1], data).item() == 0
+def test_interaction_is_bilinear() -> None:
+    model = simple_model(interaction_rank=2, gate_actions=False)
+    theta, h = random_theta(model, 2), random_h(model, 2)
+    x = torch.randn(2, 6, model.n_features + model.action_dim)
+    U, V, C = (theta[f"interaction_{name}"] for name in ("input", "situation", "output"))
+    z = x @ theta["weight_0"] + theta["bias_0"][:, None] + h[:, None] @ theta["embedding"]
+    z = z + ((x @ U) * (h[:, None] @ V)) @ C
+    hidden = F.silu(F.silu(z) @ theta["weight_1"] + theta["bias_1"][:, None])
+    expected = hidden @ theta["weight_2"] + theta["bias_2"][:, None]
+    torch.testing.assert_close(model.predict(theta, h[:, None], x), expected)
 
 
 # --- angles -----------------------------------------------------------------------------------------------
@@ -195,7 +214,7 @@ def test_nothing_but_padding_has_no_loss() -> None:
 )
 def test_full_turns_of_an_angle_change_nothing(angle: float, change: float, turns: int, next_turns: int) -> None:
     model = simple_model(obs_dim=2, angle_dims=[1]).double()
-    theta, h = expand(model.parameters_by_name(), 1), model.embeddings[:1]
+    theta, h = model.parameters_by_name(), model.embeddings[:, 0]
     obs, action = torch.tensor([[[0.3, angle]]], dtype=torch.float64), torch.rand(1, 1, 2, dtype=torch.float64)
     next_obs = torch.tensor([[[0.1, angle + change]]], dtype=torch.float64)
     turn = torch.tensor([0.0, 2 * math.pi], dtype=torch.float64)
@@ -222,6 +241,62 @@ def test_features_are_the_other_dimensions_and_sine_and_cosine() -> None:
     model = simple_model(obs_dim=3, angle_dims=[1])
     features = model.features(torch.tensor([[2.0, math.pi / 2, 5.0]]))
     torch.testing.assert_close(features, torch.tensor([[2.0, 5.0, 1.0, 0.0]]), atol=1e-6, rtol=0)
+
+
+# --- quaternions ------------------------------------------------------------------------------------------
+
+
+def quaternions(*shape: int) -> torch.Tensor:
+    return F.normalize(torch.randn(*shape, 4, dtype=torch.float64), dim=-1)
+
+
+def posed(others: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+    """Observations of five dimensions: one number, then a quaternion."""
+    return torch.cat([others, q], dim=-1)
+
+
+@given(st.integers(0, 1000), st.sampled_from([-1.0, 1.0]), st.sampled_from([-1.0, 1.0]))
+def test_orientation_is_the_same_for_q_and_minus_q(seed: int, sign: float, next_sign: float) -> None:
+    model = simple_model(obs_dim=5, quaternion_dims=(1, 2, 3, 4)).double()
+    torch.manual_seed(seed)
+    q, q_next, other = quaternions(2, 3), quaternions(2, 3), torch.randn(2, 3, 1, dtype=torch.float64)
+    obs, next_obs = posed(other, q), posed(other + 0.2, q_next)
+    turned, next_turned = posed(other, sign * q), posed(other + 0.2, next_sign * q_next)
+    torch.testing.assert_close(model.features(turned), model.features(obs))
+    target, expected = model.targets(turned, next_turned), model.targets(obs, next_obs)
+    torch.testing.assert_close(target[..., :1], expected[..., :1])
+    torch.testing.assert_close(target[..., 1:], sign * expected[..., 1:])
+    reached = turned + target
+    torch.testing.assert_close(model.features(reached), model.features(next_obs))
+    assert (target[..., 1:].norm(dim=-1) <= math.sqrt(2) + 1e-9).all()  # the short way round
+
+
+def test_quaternion_enters_as_the_products_of_its_parts() -> None:
+    model = simple_model(obs_dim=5, quaternion_dims=(1, 2, 3, 4))
+    features = model.features(torch.tensor([[7.0, 0.1, 0.2, 0.3, 0.4]]))
+    products = [0.01, 0.02, 0.03, 0.04, 0.04, 0.06, 0.08, 0.09, 0.12, 0.16]
+    torch.testing.assert_close(features, torch.tensor([[7.0, *products]]))
+    assert model.n_features == 11
+
+
+def test_rotation_is_linear_in_the_products() -> None:
+    """A turn of the sensor maps the features of all orientations by one matrix."""
+    model = simple_model(obs_dim=4, quaternion_dims=(0, 1, 2, 3)).double()
+    torch.manual_seed(0)
+    q, c, s = quaternions(40), math.cos(0.3), math.sin(0.3)
+    x, y, z, w = q.unbind(dim=-1)
+    turned = torch.stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z], dim=-1)
+    solution = torch.linalg.lstsq(model.features(q[:20]), model.features(turned[:20])).solution
+    torch.testing.assert_close(model.features(q[20:]) @ solution, model.features(turned[20:]))
+
+
+def test_observations_are_not_touched() -> None:
+    model = simple_model(obs_dim=5, quaternion_dims=(1, 2, 3, 4), angle_dims=(0,))
+    obs, _, next_obs = random_transitions(model, 3, 4)
+    before, next_before = obs.clone(), -next_obs
+    model.targets(obs, -next_obs)
+    assert torch.equal(obs, before)
+    assert torch.equal(-next_obs, next_before)
 
 
 # --- normalisation ----------------------------------------------------------------------------------------

@@ -135,6 +135,33 @@ def test_angles_are_those_of_the_environment_or_of_the_user(make_env: MakeEnv) -
     assert FAMLE("Pendulum-v1", device="cpu")._angle_dims == ()
 
 
+def test_quaternions_are_those_of_the_environment_or_of_the_user(make_env: MakeEnv) -> None:
+    ant = make_env("FamleAnt-v0")
+    assert FAMLE(ant, device="cpu", pretrained=False)._quaternion_dims == (1, 2, 3, 4)
+    own = FAMLE(ant, device="cpu", pretrained=False, quaternion_dims=())
+    assert own._quaternion_dims == ()
+    assert own._new_dynamics(2).n_features == 27
+    assert FAMLE(make_env(), device="cpu")._quaternion_dims == ()
+    turned = FAMLE(make_env(), device="cpu", angle_dims=(0,), quaternion_dims=(4, 3, 2, 1))
+    assert turned._new_dynamics(2).n_features == 7 + 2 + 10
+
+
+@pytest.mark.parametrize(
+    ("dims", "message"),
+    [
+        ({"quaternion_dims": (1, 2, 3)}, "four dimensions or none"),
+        ({"quaternion_dims": (1, 2, 3, 3), "angle_dims": ()}, "twice"),
+        ({"quaternion_dims": (1, 2, 3, 4), "angle_dims": (4,)}, "twice"),
+        ({"angle_dims": (5, 5)}, "twice"),
+        ({"angle_dims": (12,)}, "has not"),
+        ({"quaternion_dims": (-1, 2, 3, 4), "angle_dims": ()}, "has not"),
+    ],
+)
+def test_dimensions_that_make_no_sense_are_refused(make_env: MakeEnv, dims: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        FAMLE(make_env(), device="cpu", **dims)
+
+
 # --- situations -------------------------------------------------------------------------------------------
 
 
@@ -220,10 +247,28 @@ def test_environments_made_for_the_situations_are_closed(make_env: MakeEnv) -> N
         return made[-1]
 
     FAMLE(make_env(), seed=0, device="cpu", transitions_per_situation=2).collect([factory, factory])
-    assert len(made) == 2
+    assert len(made) == 4  # asked for their situation, and run
     for env in made:
         with pytest.raises(RuntimeError, match="closed"):
-            env.unwrapped.step(np.zeros(5))
+            env.unwrapped.reset()
+
+
+def test_environments_with_other_spaces_are_closed(make_env: MakeEnv) -> None:
+    made: list[gym.Env[Any, Any]] = []
+
+    class Closing(Odd):
+        closed = False
+
+        def close(self) -> None:
+            self.closed = True
+
+    def factory() -> gym.Env[Any, Any]:
+        made.append(Closing(BOX, BOX))
+        return made[-1]
+
+    with pytest.raises(ValueError, match="must have the agent's spaces"):
+        FAMLE(make_env(), device="cpu").collect([factory, factory])
+    assert [env.closed for env in made] == [True]
 
 
 # --- what is refused --------------------------------------------------------------------------------------

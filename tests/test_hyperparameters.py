@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from famle_agent import FAMLE, Hyperparameters
 from famle_agent.hyperparameters import known_robots, robot_of
+from famle_agent.joint_training import JointTraining
 from famle_agent.planning import ICEM, MPPI, RandomShooting
 
 MODES = ("ours", "paper")
@@ -47,6 +48,10 @@ def test_paper_mode_has_the_settings_of_the_paper(robot: str) -> None:
     assert isinstance(paper.make_planner(), RandomShooting)
     assert paper.inner_optimizer == "sgd"
     assert paper.gate_actions is False
+    assert paper.compose is False
+    assert (paper.hazard, paper.likelihood_power) == (0, 1)
+    assert (paper.interaction_rank, paper.members, paper.degrees_of_freedom) == (0, 1, 0)
+    assert (paper.rounds, paper.joint_iterations, paper.round_iterations) == (0, 0, 0)
     assert paper.meta_batch_size == 1
     assert paper.action_hold == 1
     assert paper.forget_at_reset is False
@@ -54,6 +59,7 @@ def test_paper_mode_has_the_settings_of_the_paper(robot: str) -> None:
 
 def test_robot_of_an_environment() -> None:
     assert robot_of("FamleReacher-v0") is known_robots()["reacher"]
+    assert robot_of("FamleAnt-v0") is known_robots()["ant"]
     for unknown in ("Pendulum-v1", None, ""):
         assert robot_of(unknown) is known_robots()["default"]
 
@@ -67,6 +73,37 @@ def test_planner_gets_its_settings(planner: str, kind: type) -> None:
     assert (made.horizon, made.candidates) == (7, 9)
     if kind is not RandomShooting:
         assert (made.iterations, made.init_std) == (4, 0.3)
+
+
+def test_iterations_of_the_rounds_add_up() -> None:
+    settings = Hyperparameters(joint_iterations=100, round_iterations=20, meta_iterations=7)
+    assert settings.iterations(0) == 107
+    assert settings.iterations(3) == 167
+    assert settings.iterations(3, last=False) == 160
+    assert [settings.joint_training(i).iterations for i in range(3)] == [100, 20, 20]
+
+
+def test_joint_training_gets_its_settings() -> None:
+    made = Hyperparameters(joint_iterations=3, joint_lr=0.1, joint_embedding_lr=0.2, joint_batch_size=9)
+    assert made.joint_training(0) == JointTraining(3, lr=0.1, embedding_lr=0.2, batch_size=9)
+
+
+@pytest.mark.parametrize(
+    ("change", "alike"),
+    [
+        ({}, True),
+        ({"horizon": 3, "candidates": 7, "adapt_every": 1, "compose": True, "planner": "mppi"}, True),
+        ({"hazard": 0.1, "likelihood_power": 0.5}, True),
+        ({"hidden": (3,)}, False),
+        ({"members": 2}, False),
+        ({"joint_iterations": 1}, False),
+        ({"inner_steps": 1, "horizon": 3}, False),
+        ({"transitions_per_situation": 1}, False),
+    ],
+)
+def test_settings_of_the_life_on_a_robot_do_not_matter_for_what_was_learnt(change: dict[str, Any], alike: bool) -> None:
+    assert Hyperparameters().learnt_alike(Hyperparameters.from_dict(change)) == alike
+    assert Hyperparameters.from_dict(change).learnt_alike(Hyperparameters()) == alike
 
 
 def test_adaptation_inherits_what_is_not_said_otherwise() -> None:
@@ -89,6 +126,12 @@ def test_adaptation_inherits_what_is_not_said_otherwise() -> None:
             "planner": st.sampled_from(["icem", "mppi", "random_shooting"]),
             "gate_actions": st.booleans(),
             "noise_beta": st.floats(0, 4),
+            "rounds": st.integers(0, 9),
+            "members": st.integers(1, 9),
+            "interaction_rank": st.integers(0, 9),
+            "degrees_of_freedom": st.floats(0, 30) | st.integers(0, 30),
+            "joint_iterations": st.integers(0, 9),
+            "compose": st.booleans(),
         },
     )
 )
@@ -127,6 +170,22 @@ def test_unknown_setting_names_the_one_that_was_meant(name: str, suggestion: str
         ("planner", "cem"),
         ("inner_optimizer", "lion"),
         ("noise_beta", -1.0),
+        ("rounds", -1),
+        ("hazard", -0.1),
+        ("hazard", 1.0),
+        ("hazard", float("nan")),
+        ("likelihood_power", -0.5),
+        ("round_transitions", 0),
+        ("members", 0),
+        ("interaction_rank", -1),
+        ("degrees_of_freedom", -0.5),
+        ("degrees_of_freedom", float("nan")),
+        ("joint_iterations", -1),
+        ("round_iterations", -1),
+        ("joint_lr", -1e-3),
+        ("joint_embedding_lr", -1e-3),
+        ("joint_batch_size", 0),
+        ("meta_iterations", -1),
     ],
 )
 def test_value_out_of_range_is_refused(name: str, value: Any) -> None:
@@ -135,7 +194,18 @@ def test_value_out_of_range_is_refused(name: str, value: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("horizon", "10"), ("inner_lr", "fast"), ("gate_actions", 1), ("horizon", True)]
+    ("name", "value"),
+    [
+        ("horizon", "10"),
+        ("inner_lr", "fast"),
+        ("gate_actions", 1),
+        ("horizon", True),
+        ("compose", 1),
+        ("rounds", True),
+        ("rounds", 1.5),
+        ("members", 2.0),
+        ("degrees_of_freedom", "3"),
+    ],
 )
 def test_value_of_the_wrong_type_is_refused(name: str, value: Any) -> None:
     with pytest.raises(TypeError, match=name):

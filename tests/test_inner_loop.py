@@ -23,7 +23,7 @@ def some_data(size: int, seed: int = 0) -> Batch:
 
 
 def start(model: Dynamics, size: int) -> tuple[Theta, torch.Tensor]:
-    return expand(model.parameters_by_name(), size), model.embeddings.detach()[:size]
+    return expand(model.parameters_by_name(), size), model.embeddings_of(torch.arange(size))
 
 
 @given(st.integers(0, 4), st.floats(0.0, 0.1), st.floats(0.0, 0.5))
@@ -57,7 +57,7 @@ def test_situations_do_not_influence_each_other(optimizer: str) -> None:
     for i in range(3):
         row = slice(i, i + 1)
         alone = Batch(data.x[row], data.y[row], data.weight[row])
-        one, h_one, loss = loop(model, expand(model.parameters_by_name(), 1), model.embeddings[row], lambda b=alone: b)
+        one, h_one, loss = loop(model, model.parameters_by_name(), model.embeddings[0, row], lambda b=alone: b)
         torch.testing.assert_close(h[row], h_one)
         torch.testing.assert_close(losses[:, row], loss)
         for name, value in one.items():
@@ -113,3 +113,20 @@ def test_gradients_are_found_where_they_are_switched_off() -> None:
     with torch.no_grad():
         theta, *_ = InnerLoop(1, 0.1, 0.1)(model, *start(model, 1), lambda: data)
     assert not torch.equal(theta["weight_0"], start(model, 1)[0]["weight_0"])
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_members_of_an_ensemble_do_not_influence_each_other(optimizer: str) -> None:
+    torch.manual_seed(0)
+    model, data = Dynamics(2, 1, n_situations=3, embedding_dim=2, hidden=(6,), members=2), some_data(6)
+    loop, c = InnerLoop(5, 0.05, 0.2, optimizer), torch.arange(3)
+    theta, h, losses = loop(model, expand(model.parameters_by_name(), 3), model.embeddings_of(c), lambda: data)
+    for member in range(2):
+        alone = Dynamics(2, 1, n_situations=3, embedding_dim=2, hidden=(6,))
+        own = {name: value[member : member + 1] for name, value in model.parameters_by_name().items()}
+        batch = Batch(data.x[member::2], data.y[member::2], data.weight[member::2])
+        one, h_one, loss = loop(alone, expand(own, 3), model.embeddings[member], lambda b=batch: b)
+        torch.testing.assert_close(h[member::2], h_one)
+        torch.testing.assert_close(losses[:, member::2], loss)
+        for name, value in one.items():
+            torch.testing.assert_close(theta[name][member::2], value)

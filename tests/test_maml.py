@@ -38,7 +38,7 @@ def loss_after_adaptation(model: Dynamics, seed: int) -> float:
     support, query = (
         Batch(data.x[:, part], data.y[:, part], data.weight[:, part]) for part in (slice(5), slice(5, 20))
     )
-    theta, h = expand(model.parameters_by_name(), 100), model.embeddings.detach().expand(100, -1)
+    theta, h = expand(model.parameters_by_name(), 100), model.embeddings_of(torch.zeros(100, dtype=torch.long))
     theta, h, _ = INNER_LOOP(model, theta, h, lambda: support)
     return model.loss(theta, h, query).mean().item()
 
@@ -69,7 +69,7 @@ def test_gradient_is_that_of_the_adapted_loss() -> None:
     model, data = fresh_model().double(), situations(4, seed=3)
     support = Batch(*(value[:, :5].double() for value in (data.x, data.y, data.weight)))
     query = Batch(*(value[:, 5:].double() for value in (data.x, data.y, data.weight)))
-    h = model.embeddings.detach().expand(4, -1)
+    h = model.embeddings_of(torch.zeros(4, dtype=torch.long))
 
     def adapted_loss(maml: MAML, theta: Theta) -> torch.Tensor:
         theta_tilde, _ = maml._adapt(model, expand(theta, 4), h, support, INNER_LOOP)

@@ -1,0 +1,365 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pybullet
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from famle_envs import Situation
+from famle_envs.ant import AntEnv
+
+Array = npt.NDArray[Any]
+Make = Callable[..., AntEnv]
+
+JOINTS = range(8)
+HEIGHT = 0
+QUATERNION = slice(1, 5)
+ANGLES = slice(5, 13)
+VELOCITY = slice(13, 16)
+SPEEDS = slice(19, 27)
+REST = np.zeros(8)
+PERIOD = 1 / 60.6
+MEAN_ANGLES = np.array([0.0, math.pi / 4] * 4)
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+
+@pytest.fixture
+def make() -> Iterator[Make]:
+    """Makes bare ants, already reset, and closes them in the end."""
+    made: list[AntEnv] = []
+
+    def make_ant(**kwargs: Any) -> AntEnv:
+        made.append(AntEnv(**kwargs))
+        made[-1].reset(seed=0)
+        return made[-1]
+
+    yield make_ant
+    for env in made:
+        env.close()
+
+
+def commands(steps: int = 60, seed: int = 0) -> Array:
+    """Random actions of which every second one is at full torque."""
+    actions = np.random.default_rng(seed).uniform(-1, 1, (steps, 8))
+    actions[::2] = np.sign(actions[::2])
+    return actions
+
+
+def follow(env: AntEnv, actions: Array) -> Array:
+    """All observations after the actions."""
+    return np.stack([env.step(action)[0] for action in actions])
+
+
+def settle(env: AntEnv) -> Array:
+    """The observation of an ant that has come to rest on its feet."""
+    return follow(env, np.zeros((120, 8)))[-1]
+
+
+def place_of(env: AntEnv) -> Array:
+    return np.array(pybullet.getBasePositionAndOrientation(env._robot, physicsClientId=env._client)[0])
+
+
+def put(env: AntEnv, place: tuple[float, float, float], quaternion: tuple[float, ...] = LEVEL) -> None:
+    pybullet.resetBasePositionAndOrientation(env._robot, place, quaternion, physicsClientId=env._client)
+
+
+def push(env: AntEnv, speed: float) -> None:
+    pybullet.resetBaseVelocity(env._robot, (speed, 0, 0), (0, 0, 0), physicsClientId=env._client)
+
+
+def momenta(env: AntEnv) -> Array:
+    """Of the torso and of each link, (9, 3)."""
+    robot, client = env._robot, env._client
+    velocities = [pybullet.getBaseVelocity(robot, physicsClientId=client)[0]]
+    masses = [pybullet.getDynamicsInfo(robot, -1, physicsClientId=client)[0]]
+    for link in JOINTS:
+        state = pybullet.getLinkState(robot, link, computeLinkVelocity=True, physicsClientId=client)
+        velocities.append(state[6])
+        masses.append(pybullet.getDynamicsInfo(robot, link, physicsClientId=client)[0])
+    return np.array(masses)[:, None] * np.array(velocities)
+
+
+# --- Observations ---
+
+
+def test_observation_is_the_state_of_the_simulator_in_the_documented_order(make: Make) -> None:
+    env = make()
+    robot, client = env._robot, env._client
+    for action in commands(40):
+        obs = env.step(action)[0]
+        place, quaternion = pybullet.getBasePositionAndOrientation(robot, physicsClientId=client)
+        velocity, angular = pybullet.getBaseVelocity(robot, physicsClientId=client)
+        joints = np.array([pybullet.getJointState(robot, j, physicsClientId=client)[:2] for j in JOINTS])
+        upwards = np.array(quaternion) * (1.0 if quaternion[3] >= 0 else -1.0)
+        expected = np.concatenate([place[2:], upwards, joints[:, 0], velocity, angular, joints[:, 1]])
+        assert obs.shape == (27,)
+        assert obs.dtype == np.float32
+        np.testing.assert_allclose(obs, expected, rtol=1e-6, atol=1e-7)
+
+
+def test_velocities_are_those_at_which_the_measured_positions_change(make: Make) -> None:
+    env = make(control_rate=500)
+    put(env, (0, 0, 5), tuple(Rotation.from_euler("z", 2.0).as_quat()))
+    before = follow(env, np.tile(0.1, (20, 8)))[-1]
+    place, orientation = place_of(env), Rotation.from_quat(before[QUATERNION])
+    after = env.step(np.full(8, 0.1))[0]
+    turned = (Rotation.from_quat(after[QUATERNION]) * orientation.inv()).as_rotvec()
+    np.testing.assert_allclose((place_of(env) - place) * 500, after[VELOCITY], atol=0.05)
+    np.testing.assert_allclose(turned * 500, after[16:19], rtol=0.03, atol=0.01)
+    np.testing.assert_allclose((after[ANGLES] - before[ANGLES]) * 500, after[SPEEDS], rtol=0.03)
+    assert np.abs(after[SPEEDS]).min() > 0.2
+
+
+def test_legs_are_front_left_back_left_back_right_and_front_right(make: Make) -> None:
+    env = make()
+    feet = [pybullet.getLinkState(env._robot, joint, physicsClientId=env._client)[0] for joint in (1, 3, 5, 7)]
+    np.testing.assert_array_equal(np.sign(feet)[:, :2], [[1, 1], [-1, 1], [-1, -1], [1, -1]])
+
+
+def test_ant_under_long_random_full_torques_stays_finite_and_near_its_joint_limits(make: Make) -> None:
+    env = make()
+    rows = follow(env, np.sign(commands(1000)))
+    lower, upper = env.joint_limits
+    assert np.isfinite(rows).all()
+    assert (rows[:, ANGLES] > lower - 0.35).all()
+    assert (rows[:, ANGLES] < upper + 0.35).all()
+    assert np.abs(rows[:, SPEEDS]).max() < 100.0
+    assert rows[:, HEIGHT].max() < 5.0
+
+
+def test_ant_without_torque_comes_to_rest_above_the_height_of_a_fall(make: Make) -> None:
+    obs = settle(make())
+    assert 0.3 < obs[HEIGHT] < 0.6
+    np.testing.assert_allclose(obs[13:], 0.0, atol=0.02)
+
+
+def test_torques_within_the_robot_move_it_as_a_whole_hardly(make: Make) -> None:
+    env = make()
+    put(env, (0, 0, 5))
+    pybullet.setGravity(0, 0, 0, physicsClientId=env._client)
+    totals, exchanged = [], []
+    for action in 0.3 * np.sign(commands()):
+        env.step(action)
+        parts = momenta(env)
+        totals.append(np.linalg.norm(parts.sum(axis=0)))
+        exchanged.append(np.linalg.norm(parts, axis=1).sum())
+    assert np.mean(exchanged) > 100.0
+    assert max(totals) < 0.1 * np.mean(exchanged)
+
+
+# --- Starts, ends and rewards ---
+
+
+def test_start_is_random_near_the_middle_of_the_joints_and_follows_the_seed(make: Make) -> None:
+    env = make()
+    starts = np.stack([env.reset(seed=seed)[0] for seed in range(50)])
+    off = starts[:, ANGLES] - MEAN_ANGLES
+    assert np.abs(off).max() < 0.1 + 1e-6
+    assert (np.ptp(off, axis=0) > 0.15).all()
+    np.testing.assert_array_equal(env.reset(seed=7)[0], starts[7])
+    assert (env.reset()[0] != starts[7]).any()
+    at_rest = np.delete(starts, range(5, 13), axis=1)
+    np.testing.assert_array_equal(at_rest, np.tile([0.5, *LEVEL, *[0.0] * 14], (50, 1)))
+
+
+@pytest.mark.parametrize("terminate", [False, True])
+def test_fall_ends_the_episode_only_where_it_shall(make: Make, terminate: bool) -> None:
+    env = make(terminate_when_fallen=terminate)
+    assert not any(env.step(action)[2] for action in 0.3 * commands(30))
+    put(env, (0, 0, 0.3), (1.0, 0.0, 0.0, 0.0))  # on its back
+    flags = [env.step(REST)[2] for _ in range(60)]
+    assert place_of(env)[2] < 0.26
+    assert flags[-1] is terminate
+
+
+def test_return_is_the_way_along_the_world_x_axis(make: Make) -> None:
+    env = make(situation="friction x 0.05, yaw sensor off by 90 deg")
+    put(env, (0, 0, 0.5), tuple(Rotation.from_euler("z", 1.0).as_quat()))
+    start = place_of(env)
+    push(env, 2.0)
+    rewards = [env.step(action)[1] for action in 0.2 * commands(150)]
+    way = place_of(env) - start
+    assert way[0] > 1.0
+    assert sum(rewards) * PERIOD == pytest.approx(way[0], rel=0.05)
+
+
+@pytest.mark.parametrize("shape", [(27,), (6, 27), (2, 3, 27)])
+def test_reward_of_a_batch_is_its_x_velocity_in_numpy_and_torch(make: Make, shape: tuple[int, ...]) -> None:
+    env = make()
+    next_obs = np.random.default_rng(0).normal(size=shape).astype(np.float32)
+    np.testing.assert_array_equal(env.reward_fn(None, None, next_obs), next_obs[..., 13])
+    rewards = env.reward_fn(None, None, torch.from_numpy(next_obs))
+    assert isinstance(rewards, torch.Tensor)
+    np.testing.assert_array_equal(rewards.numpy(), next_obs[..., 13])
+
+
+# --- Faults of the joints ---
+
+
+@pytest.mark.parametrize("joint", JOINTS)
+@pytest.mark.parametrize("gain", [0.0, 0.5, -0.25, -1.0])
+def test_gain_scales_the_torque_of_its_joint_only(make: Make, joint: int, gain: float) -> None:
+    actions, scaled = commands(), commands()
+    scaled[:, joint] *= gain
+    broken = follow(make(situation={"motor_gain": [1.0] * joint + [gain]}), actions)
+    np.testing.assert_array_equal(broken, follow(make(), scaled))
+    assert np.abs(broken - follow(make(), actions)).max() > 0.1
+
+
+def test_command_of_a_dead_joint_does_nothing(make: Make) -> None:
+    one, other = make(situation="joint 3 dead"), make(situation="joint 3 dead")
+    actions = commands()
+    rows = follow(one, actions)
+    actions[:, 3] *= -1.0
+    np.testing.assert_array_equal(follow(other, actions), rows)
+
+
+@pytest.mark.parametrize("joint", JOINTS)
+def test_joint_locked_in_mid_run_stays_near_where_it_was_while_the_others_are_driven_hard(
+    make: Make, joint: int
+) -> None:
+    env = make()
+    locked_at = follow(env, 0.2 * commands(10))[-1, 5 + joint]
+    env.set_situation({"locked_joints": [joint]})
+    angles = follow(env, np.sign(commands(120, seed=1)))[:, ANGLES]
+    assert np.abs(angles[:, joint] - locked_at).max() < 0.06
+    assert np.delete(np.ptp(angles, axis=0), joint).min() > 0.3
+
+
+# --- The yaw sensor ---
+
+
+@given(st.floats(-10, 10), st.floats(-10, 10))
+def test_yaw_error_turns_the_measured_orientation_about_the_vertical_and_nothing_else(one: float, two: float) -> None:
+    with closing(AntEnv()) as env:
+        rows = []
+        for error in (0.0, one, one + two):
+            env.reset(seed=0, options={"situation": {"orientation_error": error}})
+            rows.append(follow(env, commands(30)))
+    true, off, further = (Rotation.from_quat(row[:, QUATERNION]) for row in rows)
+    for start, turned, error in ((true, off, one), (off, further, two), (true, further, one + two)):
+        missed = (Rotation.from_euler("z", error) * start).inv() * turned
+        np.testing.assert_allclose(missed.magnitude(), 0.0, atol=1e-5)
+    for row in rows:
+        assert (row[:, 4] >= 0.0).all()
+        np.testing.assert_allclose(np.linalg.norm(row[:, QUATERNION], axis=1), 1.0, atol=1e-6)
+        np.testing.assert_array_equal(np.delete(row, range(1, 5), 1), np.delete(rows[0], range(1, 5), 1))
+
+
+@pytest.mark.parametrize("degrees", range(30, 331, 30))
+def test_preset_of_the_yaw_sensor_is_off_by_that_angle(make: Make, degrees: int) -> None:
+    env = make(situation=f"yaw sensor off by {degrees} deg")
+    measured = Rotation.from_quat(env.reset()[0][QUATERNION])
+    missed = Rotation.from_euler("z", degrees, degrees=True).inv() * measured
+    assert missed.magnitude() == pytest.approx(0.0, abs=1e-6)
+
+
+# --- The floor ---
+
+
+def slide(env: AntEnv) -> float:
+    """How far an ant at rest goes after a push."""
+    settle(env)
+    start = place_of(env)
+    push(env, 2.0)
+    settle(env)
+    return float((place_of(env) - start)[0])
+
+
+def test_ant_slides_further_on_a_slippery_floor_until_it_is_dry_again(make: Make) -> None:
+    env = make()
+    dry = slide(env)
+    env.reset(seed=0, options={"situation": "friction x 0.05"})
+    slippery = slide(env)
+    env.reset(seed=0, options={"situation": None})
+    assert slippery > 4.0 * dry > 0.0
+    assert slide(env) == dry
+
+
+def test_floor_becomes_slippery_under_the_feet_of_a_standing_ant(make: Make) -> None:
+    env = make()
+    settle(env)
+    env.set_situation("friction x 0.05")
+    assert slide(env) > 1.0
+
+
+# --- The control rate ---
+
+
+@pytest.mark.parametrize(("kwargs", "period"), [({}, PERIOD), ({"control_rate": 100}, 0.01)])
+def test_control_period_is_the_inverse_of_the_control_rate(make: Make, kwargs: dict[str, float], period: float) -> None:
+    env = make(**kwargs)
+    put(env, (0, 0, 50))
+    falling = follow(env, np.zeros((20, 8)))[-1, 15]
+    assert env.control_period == pytest.approx(period)
+    assert falling == pytest.approx(-9.81 * 20 * period, rel=0.05)  # PyBullet's drag takes some
+
+
+def test_motion_hardly_depends_on_the_control_rate(make: Make) -> None:
+    slow, fast = make(), make(control_rate=100)
+    pushing = 0.02 * np.array([1, -1, -1, 1, 1, -1, -1, 1])
+    ends = []
+    for env in (slow, fast):
+        put(env, (0, 0, 5))
+        ends.append(follow(env, np.tile(pushing, (round(0.3 / env.control_period), 1)))[-1])
+    np.testing.assert_allclose(ends[0][:13], ends[1][:13], atol=0.05)
+    assert np.abs(ends[0][ANGLES] - MEAN_ANGLES).min() > 0.1
+
+
+@pytest.mark.parametrize("rate", [0.0, -60.6, 49.9, 500.1, math.nan, math.inf])
+def test_control_rate_out_of_range_is_refused(rate: float) -> None:
+    with pytest.raises(ValueError, match="control_rate must lie between 50 and 500 Hz"):
+        AntEnv(control_rate=rate)
+
+
+# --- Situations by name ---
+
+
+def test_training_situations_are_the_twenty_of_the_paper() -> None:
+    expected = {Situation()}
+    expected |= {Situation(motor_gain=[1] * joint + [0]) for joint in JOINTS}
+    expected |= {Situation(orientation_error=math.radians(degrees)) for degrees in range(30, 360, 30)}
+    assert AntEnv.training_situations[0].is_intact
+    assert len(AntEnv.training_situations) == len(expected) == 20
+    assert set(AntEnv.training_situations) == expected
+
+
+def test_sampled_situation_is_an_unseen_one_of_a_dead_joint_and_a_yaw_error() -> None:
+    rng = np.random.default_rng(0)
+    sampled = [AntEnv.sample_situation(rng) for _ in range(200)]
+    for situation in sampled:
+        assert situation not in AntEnv.training_situations
+        assert situation.faults == {"motor_gain", "orientation_error"}
+        assert sorted(situation.motor_gain)[:2] in ([0.0], [0.0, 1.0])
+        assert abs(situation.orientation_error) >= math.radians(15) - 1e-9
+    assert len(set(sampled)) == 200
+    assert {situation.motor_gain.index(0.0) for situation in sampled} == set(JOINTS)
+    errors = [situation.orientation_error for situation in sampled]
+    assert min(errors) < -2.5
+    assert max(errors) > 2.5
+
+
+# --- Rendering ---
+
+
+def robot_pixels(picture: Array) -> Array:
+    """Where the picture shows the torso and the legs, which are orange, unlike the floor and the feet."""
+    return picture[..., 0].astype(int) > picture[..., 2].astype(int) + 50
+
+
+def test_camera_follows_the_ant(make: Make) -> None:
+    env = make(render_mode="rgb_array")
+    before = robot_pixels(env.render())
+    put(env, (5.0, -5.0, 0.5))
+    after = robot_pixels(env.render())
+    assert before[180:300, 180:300].sum() > 1000
+    assert (before == after).mean() > 0.99
