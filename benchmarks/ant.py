@@ -47,6 +47,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "famle-window": {"hazard": 0.0, "likelihood_power": 1.0, "memory_size": 100},
     "famle-h": {**ADAPTS, "adapt_lr": 0.0},
     "famle-theta": ADAPTS,
+    "famle-validated": {**ADAPTS, "validation_size": 10},
     "random-shooting": {"planner": "random_shooting", "candidates": 10_000},
 }
 """The shipped agent with settings changed."""
@@ -74,10 +75,10 @@ class Args:
 
 DEFAULT_METHODS: dict[str, tuple[str, ...]] = {
     "unseen": ("famle", "famle-frozen", "famle-nearest", "famle-h", "famle-theta"),
-    "validation": ("famle", "famle-window", "famle-h", "famle-theta"),
+    "validation": ("famle", "famle-window", "famle-h", "famle-theta", "famle-validated"),
     "members": ("members-1", "members-2", "members-3", "famle"),
     "break": ("famle", "famle-window", "famle-frozen"),
-    "untrained": ("famle", "famle-frozen", "famle-theta"),
+    "untrained": ("famle", "famle-frozen", "famle-theta", "famle-validated"),
     "intact": ("famle",),
 }
 

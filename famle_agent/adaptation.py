@@ -170,8 +170,7 @@ class Belief:
         """This belief for the robots in ``kept`` (B,), and the other one for the rest."""
 
         def choose(mine: Tensor, theirs: Tensor) -> Tensor:
-            rows = kept.repeat_interleave(len(mine) // len(kept))
-            return torch.where(rows.view(-1, *[1] * (mine.ndim - 1)), mine, theirs)
+            return _choose(kept.repeat_interleave(len(mine) // len(kept)), mine, theirs)
 
         theta = {name: choose(value, other.theta[name]) for name, value in self.theta.items()}
         log_posterior = choose(self.log_posterior, other.log_posterior)
@@ -208,7 +207,14 @@ def filtered_posterior(candidates: Candidates, log_posterior: Tensor, log_p: Ten
 
 
 @torch.no_grad()
-def adapt(model: Dynamics, candidates: Candidates, memory: Memory, inner_loop: InnerLoop, belief: Belief) -> Belief:
+def adapt(
+    model: Dynamics,
+    candidates: Candidates,
+    memory: Memory,
+    inner_loop: InnerLoop,
+    belief: Belief,
+    validation_size: int = 0,
+) -> Belief:
     """Lines 6 and 7 of Algorithm 2 for B robots at once.
 
     Args:
@@ -217,6 +223,8 @@ def adapt(model: Dynamics, candidates: Candidates, memory: Memory, inner_loop: I
         memory: D_M.
         inner_loop: k steps of gradient descent; where they diverge, theta_meta and the embedding stay.
         belief: Its posterior counts; theta* and h* are found anew.
+        validation_size: The newest transitions, which no gradient step sees. Steps that do not make them more likely
+            are taken back, in each member of the ensemble by itself; 0 trusts all steps, as the paper does.
     """
     robots, members = len(memory.weight), model.members
 
@@ -230,7 +238,23 @@ def adapt(model: Dynamics, candidates: Candidates, memory: Memory, inner_loop: I
     if inner_loop.steps == 0:
         return start
     data = model.encode(memory.obs, memory.action, memory.next_obs, memory.weight)
-    seen = Batch(*(values.repeat_interleave(members, dim=0) for values in (data.x, data.y, data.weight)))
+    data = Batch(*(values.repeat_interleave(members, dim=0) for values in (data.x, data.y, data.weight)))
+    seen, newest = _split(data, validation_size)
     theta, h, _ = inner_loop(model, start.theta, start.h, lambda: seen)
+    if validation_size:
+        better = model.loss(theta, h, newest) < model.loss(start.theta, start.h, newest)
+        theta = {name: _choose(better, value, start.theta[name]) for name, value in theta.items()}
+        h = _choose(better, h, start.h)
     adapted = replace(start, theta=theta, h=h)
     return adapted.where(adapted.is_finite(), start)  # steps that diverged are no steps
+
+
+def _split(data: Batch, newest: int) -> tuple[Batch, Batch]:
+    """The transitions without the newest ones, and these."""
+    is_new = torch.arange(data.weight.shape[1], device=data.weight.device) >= data.weight.shape[1] - newest
+    return replace(data, weight=data.weight * ~is_new), replace(data, weight=data.weight * is_new)
+
+
+def _choose(rows: Tensor, mine: Tensor, theirs: Tensor) -> Tensor:
+    """``mine`` where the row is marked, else ``theirs``."""
+    return torch.where(rows.view(-1, *[1] * (mine.ndim - 1)), mine, theirs)

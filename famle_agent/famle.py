@@ -88,4 +88,12 @@ class FAMLE(ModelBasedAgent):
 
     def _adapt(self, memory: Memory, belief: Belief) -> Belief:
         """Algorithm 2, lines 6 and 7: the most likely embedding, then k gradient steps on theta and h."""
-        return adapt(self._require_dynamics(), self._candidates(), memory, self.hyperparameters.adaptation(), belief)
+        settings = self.hyperparameters
+        return adapt(
+            self._require_dynamics(),
+            self._candidates(),
+            memory,
+            settings.adaptation(),
+            belief,
+            settings.validation_size,
+        )

@@ -65,6 +65,8 @@ class Hyperparameters:
         adapt_steps: k of online adaptation; None takes ``inner_steps``, 0 only selects an embedding.
         adapt_lr: alpha of online adaptation; None takes ``inner_lr``.
         adapt_embedding_lr: beta of online adaptation; None takes ``embedding_lr``.
+        validation_size: The newest transitions of the memory, which gradient steps do not see and which decide whether
+            the steps are kept; 0 keeps all, as the paper does.
         forget_at_reset: Whether a new episode empties the memory; damage outlasts an episode, so not by default.
         planner: ``"icem"``, ``"mppi"`` or ``"random_shooting"`` (the paper's).
         horizon: H, steps that the planner looks ahead.
@@ -111,6 +113,7 @@ class Hyperparameters:
     adapt_steps: int | None = None
     adapt_lr: float | None = None
     adapt_embedding_lr: float | None = None
+    validation_size: int = 0
     forget_at_reset: bool = False
     planner: Literal["icem", "mppi", "random_shooting"] = "icem"
     horizon: int = 10
@@ -208,40 +211,22 @@ class Hyperparameters:
         return ICEM(self.horizon, self.candidates, elites=self.elites, **shared)  # type: ignore[arg-type]
 
 
-_ONLINE = {
-    *(
-        "compose",
-        "likelihood_power",
-        "hazard",
-        "adapt_every",
-        "memory_size",
-        "adapt_steps",
-        "adapt_lr",
-        "adapt_embedding_lr",
-        "forget_at_reset",
-    ),
-    *("planner", "horizon", "candidates", "planner_iterations", "elites", "init_std", "noise_beta", "temperature"),
-}
+_ONLINE = set(
+    """
+    compose likelihood_power hazard adapt_every memory_size adapt_steps adapt_lr adapt_embedding_lr validation_size
+    forget_at_reset planner horizon candidates planner_iterations elites init_std noise_beta temperature
+    """.split()
+)
 """Settings of the life on a robot; rounds in simulation plan too, but a model may be used with another planner."""
-_AT_LEAST_ONE = (
-    *("transitions_per_situation", "action_hold", "round_transitions", "embedding_dim", "members"),
-    *("joint_batch_size", "inner_steps", "batch_size", "meta_batch_size", "memory_size"),
-    *("horizon", "candidates", "planner_iterations", "elites"),
-)
-_AT_LEAST_ZERO = (
-    *("rounds", "interaction_rank", "degrees_of_freedom", "joint_iterations", "round_iterations", "meta_iterations"),
-    *(
-        "likelihood_power",
-        "hazard",
-        "joint_lr",
-        "joint_embedding_lr",
-        "inner_lr",
-        "embedding_lr",
-        "meta_lr",
-        "embedding_meta_lr",
-    ),
-    *("adapt_every", "adapt_steps", "adapt_lr", "adapt_embedding_lr", "init_std", "noise_beta", "temperature"),
-)
+_AT_LEAST_ONE = """
+    transitions_per_situation action_hold round_transitions embedding_dim members joint_batch_size inner_steps batch_size
+    meta_batch_size memory_size horizon candidates planner_iterations elites
+    """.split()
+_AT_LEAST_ZERO = """
+    rounds interaction_rank degrees_of_freedom joint_iterations round_iterations meta_iterations joint_lr
+    joint_embedding_lr inner_lr embedding_lr meta_lr embedding_meta_lr likelihood_power hazard adapt_every adapt_steps
+    adapt_lr adapt_embedding_lr validation_size init_std noise_beta temperature
+    """.split()
 _LEAST = dict.fromkeys(_AT_LEAST_ONE, 1) | dict.fromkeys(_AT_LEAST_ZERO, 0)
 _CHOICES = {
     "inner_optimizer": ("sgd", "adam"),
