@@ -126,10 +126,10 @@ class Hyperparameters:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(int(width) for width in self.hidden))
-        for name, least in _LEAST.items():
-            value = getattr(self, name)
-            if value is not None and not value >= least:
-                raise ValueError(f"{name} must be at least {least}, got {value!r}.")
+        for field in dataclasses.fields(self):
+            value, least = getattr(self, field.name), int(field.name in _AT_LEAST_ONE)
+            if isinstance(value, (int, float)) and not value >= least:
+                raise ValueError(f"{field.name} must be at least {least}, got {value!r}.")
         if self.hazard >= 1.0:
             raise ValueError(f"hazard is a probability below 1, got {self.hazard!r}.")
         if not self.hidden or min(self.hidden) < 1:
@@ -211,23 +211,18 @@ class Hyperparameters:
         return ICEM(self.horizon, self.candidates, elites=self.elites, **shared)  # type: ignore[arg-type]
 
 
-_ONLINE = set(
-    """
-    compose likelihood_power hazard adapt_every memory_size adapt_steps adapt_lr adapt_embedding_lr validation_size
-    forget_at_reset planner horizon candidates planner_iterations elites init_std noise_beta temperature
-    """.split()
-)
+_ONLINE = {
+    *("compose", "likelihood_power", "hazard", "adapt_every", "memory_size", "forget_at_reset"),
+    *("adapt_steps", "adapt_lr", "adapt_embedding_lr", "validation_size"),
+    *("planner", "horizon", "candidates", "planner_iterations", "elites", "init_std", "noise_beta", "temperature"),
+}
 """Settings of the life on a robot; rounds in simulation plan too, but a model may be used with another planner."""
-_AT_LEAST_ONE = """
-    transitions_per_situation action_hold round_transitions embedding_dim members joint_batch_size inner_steps batch_size
-    meta_batch_size memory_size horizon candidates planner_iterations elites
-    """.split()
-_AT_LEAST_ZERO = """
-    rounds interaction_rank degrees_of_freedom joint_iterations round_iterations meta_iterations joint_lr
-    joint_embedding_lr inner_lr embedding_lr meta_lr embedding_meta_lr likelihood_power hazard adapt_every adapt_steps
-    adapt_lr adapt_embedding_lr validation_size init_std noise_beta temperature
-    """.split()
-_LEAST = dict.fromkeys(_AT_LEAST_ONE, 1) | dict.fromkeys(_AT_LEAST_ZERO, 0)
+_AT_LEAST_ONE = {
+    *("transitions_per_situation", "action_hold", "round_transitions", "embedding_dim", "members", "joint_batch_size"),
+    *("inner_steps", "batch_size", "meta_batch_size", "memory_size"),
+    *("horizon", "candidates", "planner_iterations", "elites"),
+}
+"""The other numbers may be 0."""
 _CHOICES = {
     "inner_optimizer": ("sgd", "adam"),
     "planner": ("icem", "mppi", "random_shooting"),
