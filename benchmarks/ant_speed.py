@@ -26,6 +26,7 @@ from benchmarks.speed import in_turn
 from famle_agent import FAMLEWrapper
 from famle_agent.dynamics import Batch, Dynamics, expand
 from famle_agent.inner_loop import InnerLoop
+from famle_agent.joint_training import JointTraining
 from famle_agent.walking import run_and_break
 
 SITUATIONS, BATCH = 20, 32
@@ -41,7 +42,7 @@ class Args:
     steps: int = 1000
     """Control steps of which the mean and the 99th percentile are taken."""
     threads: tuple[int, ...] = (1, 2)
-    """Threads of torch for the control step; the other figures are of one thread."""
+    """Threads of torch for the gradient and control steps; the other figures are of one thread."""
     out: Path = Path("benchmarks/results/ant-speed.json")
     """Where the result goes."""
 
@@ -94,7 +95,10 @@ def planning(repeats: int) -> dict[str, float]:
 
 
 def sgd(repeats: int) -> dict[str, float]:
-    """Inner steps of the paper's network at batch 32: one situation at a time in plain PyTorch, and ours at once."""
+    """Steps of the paper's network on 32 transitions: one situation at a time in plain PyTorch, and ours at once.
+
+    Each situation has a network of its own in Reptile's inner loop; in joint training they share one.
+    """
     model = Dynamics(27, 8, SITUATIONS, 5, HIDDEN, gate_actions=False)
     x, y = torch.randn(SITUATIONS, BATCH, 35), torch.randn(SITUATIONS, BATCH, 27)
     batch = Batch(x, y, torch.ones(SITUATIONS, BATCH))
@@ -118,9 +122,19 @@ def sgd(repeats: int) -> dict[str, float]:
             loss.backward()
             optimizer.step()
 
-    together, alone = in_turn(repeats, batched, plain)
-    ours, theirs = SITUATIONS * steps / together, steps / alone
-    return {"ours (situation-steps / s)": ours, "plain PyTorch (steps / s)": theirs, "ratio": ours / theirs}
+    data = Batch(torch.randn(SITUATIONS, 500, 35), torch.randn(SITUATIONS, 500, 27), torch.ones(SITUATIONS, 500))
+    joint = JointTraining(steps, 1e-3, 1e-3, SITUATIONS * BATCH)
+    generator = torch.Generator().manual_seed(0)
+
+    together, jointly, alone = in_turn(repeats, batched, lambda: joint(model, data, generator), plain)
+    reptile, shared, theirs = SITUATIONS * steps / together, SITUATIONS * steps / jointly, steps / alone
+    return {
+        "Reptile (situation-steps / s)": reptile,
+        "joint training (situation-steps / s)": shared,
+        "plain PyTorch (steps / s)": theirs,
+        "ratio, Reptile": reptile / theirs,
+        "ratio, joint training": shared / theirs,
+    }
 
 
 def main(args: Args) -> None:
@@ -128,10 +142,11 @@ def main(args: Args) -> None:
     torch.set_num_threads(1)
     figures: dict[str, dict[str, float]] = {
         "environment": environment(args.repeats),
-        "inner step, paper's network": sgd(args.repeats),
         "planning": planning(args.repeats),
     }
     for threads in args.threads:
+        torch.set_num_threads(threads)
+        figures[f"gradient step, {threads} thread(s)"] = sgd(args.repeats)
         figures[f"control step, {threads} thread(s)"] = control_step(args.steps, threads)
     table = Table("part", "figure", "value")
     for part, values in figures.items():

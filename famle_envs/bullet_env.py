@@ -85,6 +85,8 @@ class BulletEnv(gym.Env[Array, Array]):
         self._client: int | None = None
         self._locked_at: dict[int, float] = {}
         self._obs: Array | None = None
+        self._low, self._high = (end.astype(np.float64) for end in (self.action_space.low, self.action_space.high))
+        self._nothing = np.zeros_like(self._low)
         self._load()
 
     @property
@@ -164,9 +166,9 @@ class BulletEnv(gym.Env[Array, Array]):
         if self._obs is None:
             raise gym.error.ResetNeeded("Call reset() before step().")
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != self.action_space.shape or not math.isfinite(np.abs(action).max()):
+        if action.shape != self._low.shape or not math.isfinite(action.dot(self._nothing)):  # 0 * inf is no number
             raise ValueError(f"The action must be {self.action_space.shape} finite numbers, got {action}.")
-        self._actuate(np.minimum(np.maximum(action, self.action_space.low), self.action_space.high))
+        self._actuate(np.minimum(np.maximum(action, self._low), self._high))
         self._hold_locked_joints()
         for _ in range(self.physics_steps):
             pybullet.stepSimulation(physicsClientId=self._client)
