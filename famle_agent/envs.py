@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, count
 from typing import Any
@@ -18,7 +18,7 @@ from famle_agent.hyperparameters import known_robots
 from famle_agent.transitions import EnvSource
 from famle_envs.situation import Situation
 
-__all__ = ["EnvLike", "check_spaces", "env_attribute", "env_spec", "make_env", "situation_envs"]
+__all__ = ["EnvLike", "SituationEnvs", "check_spaces", "env_attribute", "env_spec", "make_env", "situation_envs"]
 
 EnvLike = gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]] | Situation | Mapping[str, Any] | str
 """An environment, a factory of one, or the situation of one."""
@@ -79,15 +79,25 @@ def _plain_spec(env: VecEnv) -> EnvSpec | None:
     return spec
 
 
-def situation_envs(env: VecEnv, envs: Sequence[EnvLike] | None) -> tuple[list[EnvSource], list[str]]:
+@dataclass(frozen=True)
+class SituationEnvs:
+    """One environment per training situation.
+
+    Attributes:
+        sources: Each environment that the user gave, or what makes it.
+        situations: What each situation is called; no two alike.
+    """
+
+    sources: list[EnvSource]
+    situations: list[str]
+
+
+def situation_envs(env: VecEnv, envs: Sequence[EnvLike] | None) -> SituationEnvs:
     """One environment per training situation.
 
     Args:
         env: The agent's own environment; situations are put into new ones of its kind.
         envs: What the user gave; None takes the training situations that the environment names.
-
-    Returns:
-        Each environment that the user gave, or what makes it; and what their situations are called.
 
     Raises:
         ValueError: No situation is given or known, the environment takes no ``situation``, or the spaces of one differ
@@ -114,7 +124,7 @@ def situation_envs(env: VecEnv, envs: Sequence[EnvLike] | None) -> tuple[list[En
         label = situation.label if isinstance(situation, Situation) else f"situation {i}"
         names = chain([label], (f"{label} ({j})" for j in count(i)))
         labels.append(next(name for name in names if name not in labels))
-    return sources, labels
+    return SituationEnvs(sources, labels)
 
 
 def _source(env: VecEnv, item: EnvLike) -> EnvSource:

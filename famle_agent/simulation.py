@@ -25,14 +25,22 @@ from tqdm.auto import tqdm
 from typing_extensions import Self
 
 from famle_agent.dynamics import Dynamics
-from famle_agent.envs import EnvLike, check_spaces, env_attribute, env_spec, make_env, situation_envs
+from famle_agent.envs import (
+    EnvLike,
+    SituationEnvs,
+    check_spaces,
+    env_attribute,
+    env_spec,
+    make_env,
+    situation_envs,
+)
 from famle_agent.errors import NotLearnedError
 from famle_agent.hyperparameters import Hyperparameters, robot_of
 from famle_agent.planning import RewardFn
 from famle_agent.policies import MakePolicy, make_held_uniform, make_planning
 from famle_agent.reward import LearnedReward
 from famle_agent.run_folder import RunFolder
-from famle_agent.transitions import EnvSource, Transitions, collect
+from famle_agent.transitions import Transitions, collect
 from famle_agent.units import ActionScale
 
 if TYPE_CHECKING:
@@ -227,10 +235,9 @@ class SimulationLearner(BaseAlgorithm):
             ValueError: There are no situations, an environment's spaces differ from the agent's, or the folder is of a
                 run with other settings.
         """
-        given = envs if isinstance(envs, Transitions) else None
-        sources = None if isinstance(envs, Transitions) else situation_envs(self._require_env(), envs)
-        rounds = 0 if given is not None else self.hyperparameters.rounds
-        run = None if folder is None else RunFolder(folder, self._fingerprint(sources, given))
+        source = envs if isinstance(envs, Transitions) else situation_envs(self._require_env(), envs)
+        rounds = 0 if isinstance(source, Transitions) else self.hyperparameters.rounds
+        run = None if folder is None else RunFolder(folder, self._fingerprint(source))
         if not self._custom_logger:
             name = tb_log_name or f"{type(self).__name__}_meta"
             self._logger = configure_logger(self.verbose, self.tensorboard_log, name)
@@ -244,8 +251,10 @@ class SimulationLearner(BaseAlgorithm):
         transitions, going_on = None, True
         for round_ in range(rounds + 1):
             store = None if run is None else run.transitions(round_)
-            new = given or self._collect(sources, round_, progress_bar, n_jobs, store)
-            new = self._in_model_units(new)
+            if isinstance(source, Transitions):
+                new = self._in_model_units(source)
+            else:
+                new = self._in_model_units(self._collect(source, round_, progress_bar, n_jobs, store))
             transitions = new if transitions is None else transitions.followed_by(new)
             self.situations = transitions.situations
             if run is not None and run.has_model(round_):
@@ -290,25 +299,18 @@ class SimulationLearner(BaseAlgorithm):
         return self._collect(situation_envs(self._require_env(), envs), 0, progress_bar, n_jobs, None)
 
     def _collect(
-        self,
-        sources: tuple[list[EnvSource], list[str]] | None,
-        round_: int,
-        progress_bar: bool,
-        n_jobs: int,
-        folder: Path | None,
+        self, envs: SituationEnvs, round_: int, progress_bar: bool, n_jobs: int, folder: Path | None
     ) -> Transitions:
         """Random transitions in round 0, the agent's own planning after that."""
-        if sources is None:
-            raise ValueError("There are no environments to collect from.")
-        settings, (envs, labels) = self.hyperparameters, sources
+        settings = self.hyperparameters
         make_policy: MakePolicy
         if round_ == 0:
             n, make_policy = settings.transitions_per_situation, make_held_uniform(settings.action_hold)
         else:
             n, make_policy = settings.round_transitions, self._planning()
         name = f"Simulating {round_ + 1}/{settings.rounds + 1}" if settings.rounds else "Simulating"
-        with tqdm(total=n * len(envs), desc=name, unit="step", disable=not progress_bar) as bar:
-            return collect(envs, labels, n, make_policy, self._draw_seed(), bar.update, n_jobs, folder)
+        with tqdm(total=n * len(envs.sources), desc=name, unit="step", disable=not progress_bar) as bar:
+            return collect(envs.sources, envs.situations, n, make_policy, self._draw_seed(), bar.update, n_jobs, folder)
 
     def _planning(self) -> MakePolicy:
         """What makes the agent plan with what it has learnt so far."""
@@ -324,16 +326,14 @@ class SimulationLearner(BaseAlgorithm):
 
         return make_planning(model, self.hyperparameters.make_planner(), reward_fn)
 
-    def _fingerprint(
-        self, sources: tuple[list[EnvSource], list[str]] | None, given: Transitions | None
-    ) -> dict[str, Any]:
+    def _fingerprint(self, source: SituationEnvs | Transitions) -> dict[str, Any]:
         """What two runs must have in common for one to go on where the other stopped."""
         return {
             "agent": type(self).__name__,
             "env": self._env_spec,
             "seed": self.seed,
-            "situations": None if sources is None else sources[1],
-            "transitions": None if given is None else given.digest(),
+            "situations": list(source.situations),
+            "transitions": source.digest() if isinstance(source, Transitions) else None,
             "hyperparameters": self.hyperparameters.to_dict(),
         }
 
