@@ -15,10 +15,21 @@ from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import VecEnv
 
 from famle_agent.hyperparameters import known_robots
+from famle_agent.planning import RewardFn
+from famle_agent.policies import REWARDS
 from famle_agent.transitions import EnvSource
 from famle_envs.situation import Situation
 
-__all__ = ["EnvLike", "SituationEnvs", "check_spaces", "env_attribute", "env_spec", "make_env", "situation_envs"]
+__all__ = [
+    "EnvLike",
+    "SituationEnvs",
+    "check_spaces",
+    "env_attribute",
+    "env_spec",
+    "make_env",
+    "planning_reward",
+    "situation_envs",
+]
 
 EnvLike = gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]] | Situation | Mapping[str, Any] | str
 """An environment, a factory of one, or the situation of one."""
@@ -161,6 +172,12 @@ def _check_same_spaces(made: gym.Env[Any, Any], env: VecEnv) -> None:
             f"Each situation must have the agent's spaces, {env.observation_space} and {env.action_space}; "
             f"got {made.observation_space} and {made.action_space}."
         )
+
+
+def planning_reward(env: VecEnv) -> RewardFn | None:
+    """What a planner should maximise in an environment, where it says that."""
+    known: list[RewardFn] = [env_attribute(env, name, None) for name in REWARDS if env.has_attr(name)]
+    return known[0] if known else None
 
 
 def _get(env: gym.Env[Any, Any], name: str, default: Any) -> Any:

@@ -16,7 +16,7 @@ from famle_agent.dynamics import Dynamics
 from famle_agent.planning import Model, Planner, RewardFn, imagine, shift
 from famle_agent.units import ActionScale
 
-__all__ = ["HeldUniformPolicy", "MakePolicy", "PlanningPolicy", "make_held_uniform", "make_planning"]
+__all__ = ["REWARDS", "HeldUniformPolicy", "MakePolicy", "PlanningPolicy", "make_held_uniform", "make_planning"]
 
 Array = npt.NDArray[Any]
 
@@ -27,6 +27,9 @@ class Policy(Protocol):
     def __call__(self, obs: Array, episode_start: bool) -> Array:
         """The action for an observation, in the environment's action space."""
 
+
+REWARDS = ("planning_reward_fn", "reward_fn")
+"""What an environment may call the function that a planner should maximise; the first that it has counts."""
 
 MakePolicy = Callable[[gym.Env[Any, Any], int, np.random.Generator], Policy]
 """A policy for an environment and the index of its situation; picklable where data are collected in processes."""
@@ -105,7 +108,7 @@ class make_planning:  # noqa: N801
     Attributes:
         model: On the CPU.
         planner: Looks for the actions.
-        reward_fn: r(s, a, s') for actions of the environment; None takes the environment's own.
+        reward_fn: r(s, a, s') for actions of the environment; None takes the environment's own, see :data:`REWARDS`.
     """
 
     model: Dynamics
@@ -116,7 +119,8 @@ class make_planning:  # noqa: N801
     def __call__(self, env: gym.Env[Any, Any], situation: int, rng: np.random.Generator) -> Policy:
         """See :data:`MakePolicy`."""
         scale = ActionScale.of(env.action_space, torch.device("cpu"))  # type: ignore[arg-type]
-        in_env_units: RewardFn = self.reward_fn or env.get_wrapper_attr("reward_fn")
+        own = (env.get_wrapper_attr(name) for name in REWARDS if env.has_wrapper_attr(name))
+        in_env_units: RewardFn = self.reward_fn or next(own)
         simulator = self.model.simulator(self.model.parameters_by_name(), self.model.embeddings[:, situation])
         return PlanningPolicy(
             simulator,

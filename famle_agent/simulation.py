@@ -32,6 +32,7 @@ from famle_agent.envs import (
     env_attribute,
     env_spec,
     make_env,
+    planning_reward,
     situation_envs,
 )
 from famle_agent.errors import NotLearnedError
@@ -59,8 +60,9 @@ class SimulationLearner(BaseAlgorithm):
     Args:
         env: A robot's name (``"reacher"``), a Gymnasium id, an environment or a ``VecEnv`` with one robot each.
         mode: ``"ours"`` for the settings that we found to be best, ``"paper"`` for the paper's.
-        reward_fn: r(s, a, s') for torch tensors (..., dim) -> (...). None takes the environment's
-            ``reward_fn``, and where it has none the reward is learnt with the dynamics.
+        reward_fn: r(s, a, s') for torch tensors (..., dim) -> (...), what the planner maximises. None takes the
+            environment's ``planning_reward_fn`` or ``reward_fn``, and where it has neither the reward is learnt with
+            the dynamics.
         angle_dims: Observation dimensions that are angles in rad. None takes the environment's ``angle_dims``.
         quaternion_dims: The four observation dimensions of a unit quaternion, or none of them. None takes the
             environment's ``quaternion_dims``.
@@ -165,7 +167,7 @@ class SimulationLearner(BaseAlgorithm):
         if unwrap_vec_normalize(env) is not None:
             raise ValueError("The model normalises by itself; give the environment without VecNormalize.")
         self._env_spec = env_spec(env)
-        self._env_reward_fn = env_attribute(env, "reward_fn", None)
+        self._env_reward_fn = planning_reward(env)
 
     def _check_dims(self) -> None:
         if len(self._quaternion_dims) not in (0, 4):

@@ -363,3 +363,14 @@ def test_camera_follows_the_ant(make: Make) -> None:
     after = robot_pixels(env.render())
     assert before[180:300, 180:300].sum() > 1000
     assert (before == after).mean() > 0.99
+
+
+@pytest.mark.parametrize("kind", ["numpy", "torch"])
+def test_planner_is_warned_of_tipping_over_and_the_reward_is_not(kind: str) -> None:
+    tilt = np.radians([0.0, 30.0, 90.0, 180.0])
+    obs = np.zeros((4, 27), dtype=np.float32)
+    obs[:, 1], obs[:, 4], obs[:, 13] = np.sin(tilt / 2), np.cos(tilt / 2), 2.0
+    batch = torch.from_numpy(obs) if kind == "torch" else obs
+    with closing(AntEnv()) as robot:
+        np.testing.assert_allclose(robot.reward_fn(batch, None, batch), 2.0)
+        np.testing.assert_allclose(robot.planning_reward_fn(batch, None, batch), [2.0, 2.0, -1.2, -5.2], atol=1e-5)
