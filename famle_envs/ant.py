@@ -128,8 +128,8 @@ class AntEnv(BulletEnv):
     def planning_reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
         """What a planner should look for: the reward, less 4 (0.8 - u) m/s where the ant tips over.
 
-        u is the cosine of the torso's tilt, which no error of the yaw sensor changes. An ant on its back does not get up
-        again, and a planner that looks a third of a second ahead learns that too late.
+        u is the cosine of the torso's tilt, which no error of the yaw sensor changes. An ant on its back does not get
+        up again, and a planner that looks a third of a second ahead learns that too late.
 
         Args:
             obs: Observations, (..., 27). Not used.
