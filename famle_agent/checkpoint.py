@@ -93,11 +93,10 @@ def read_checkpoint(file: File) -> tuple[dict[str, Any], dict[str, Tensor]]:
         ) from error
     if not isinstance(meta, dict) or meta.get("format") != _FORMAT:
         raise ValueError(f"{path} is no FAMLE checkpoint. Give a file written by agent.save().")
-    if meta.get("version") != _VERSION:
-        raise ValueError(
-            f"{path} has checkpoint version {meta.get('version')}, this package reads {_VERSION}; "
-            "use the release of famle that wrote it, or meta-learn again."
-        )
+    if (version := meta.get("version")) != _VERSION:
+        newer = isinstance(version, int) and version > _VERSION
+        remedy = "upgrade famle" if newer else "use the release of famle that wrote it, or meta-learn again"
+        raise ValueError(f"{path} has checkpoint version {version}, this package reads {_VERSION}; {remedy}.")
     return meta, tensors
 
 

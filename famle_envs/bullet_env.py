@@ -86,7 +86,6 @@ class BulletEnv(gym.Env[Array, Array]):
         self._locked_at: dict[int, float] = {}
         self._obs: Array | None = None
         self._low, self._high = (end.astype(np.float64) for end in (self.action_space.low, self.action_space.high))
-        self._nothing = np.zeros_like(self._low)
         self._load()
 
     @property
@@ -166,7 +165,7 @@ class BulletEnv(gym.Env[Array, Array]):
         if self._obs is None:
             raise gym.error.ResetNeeded("Call reset() before step().")
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != self._low.shape or not math.isfinite(action.dot(self._nothing)):  # 0 * inf is no number
+        if action.shape != self._low.shape or not math.isfinite(np.abs(action).max()):
             raise ValueError(f"The action must be {self.action_space.shape} finite numbers, got {action}.")
         self._actuate(np.minimum(np.maximum(action, self._low), self._high))
         self._hold_locked_joints()
