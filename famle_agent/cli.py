@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import gymnasium as gym
+import torch
 import tyro
 from rich.console import Console
 
@@ -114,6 +115,9 @@ def main(args: list[str] | None = None) -> None:
     command: Demo | MetaLearn | Run = tyro.extras.subcommand_cli_from_dict(
         {"demo": Demo, "meta-learn": MetaLearn, "run": Run}, args=args, prog="famle"
     )
+    if not isinstance(command, MetaLearn):
+        # A plan's matrices are small: a second thread gains little, and waits long where the machine is busy.
+        torch.set_num_threads(1)
     try:
         command()
     except (ValueError, TypeError, OSError, NotLearnedError) as error:
