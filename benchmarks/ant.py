@@ -42,6 +42,7 @@ ADAPTS: dict[str, Any] = {"adapt_every": 10, "adapt_steps": 10, "adapt_lr": 3e-4
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "famle": {},
+    "famle-48": {"candidates": 48},
     "famle-frozen": {"adapt_every": 0},
     "famle-nearest": {"compose": False},
     "famle-window": {"hazard": 0.0, "likelihood_power": 1.0, "memory_size": 100},
