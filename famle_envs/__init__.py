@@ -21,3 +21,13 @@ gym.register(
     max_episode_steps=1000,
     reward_threshold=800.0,
 )
+gym.register(
+    id="FamleQuadruped-v0",
+    entry_point="famle_envs.quadruped:QuadrupedEnv",
+    max_episode_steps=80,
+)
+gym.register(
+    id="FamleMinitaur-v0",
+    entry_point="famle_envs.minitaur:MinitaurEnv",
+    max_episode_steps=60,
+)

@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from contextlib import suppress
 from importlib.resources import as_file, files
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -16,6 +16,9 @@ import pybullet
 from gymnasium import spaces
 
 from famle_envs.situation import Situation, resolve_situation
+
+if TYPE_CHECKING:
+    from importlib.resources.abc import Traversable
 
 __all__ = ["Array", "BulletEnv"]
 
@@ -44,7 +47,9 @@ class BulletEnv(gym.Env[Array, Array]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (Gymnasium's own type)
 
     asset: ClassVar[str]
-    """File of the robot's description in ``famle_envs/assets``."""
+    """File of the robot's description."""
+    asset_folder: ClassVar[Traversable] = files("famle_envs") / "assets"
+    """Where it lies."""
     joints: ClassVar[tuple[int, ...]]
     """PyBullet's indices of the motorised joints; a :class:`Situation` counts joints in this order."""
     supported_faults: ClassVar[frozenset[str]]
@@ -108,9 +113,16 @@ class BulletEnv(gym.Env[Array, Array]):
         resolved = resolve_situation(situation, cls.presets)
         return resolved.for_robot(cls.__name__, len(cls.joints), cls.supported_faults)
 
+    def _simulate(self, action: Array) -> None:
+        """One control step with an action that lies in the action space."""
+        self._actuate(action)
+        self._hold_locked_joints()
+        for _ in range(self.physics_steps):
+            pybullet.stepSimulation(physicsClientId=self._client)
+
     @abstractmethod
     def _actuate(self, action: Array) -> None:
-        """Sets the motors for one control step. ``action`` has shape (n_joints,) and lies in the action space."""
+        """Sets the motors for one control step."""
 
     @abstractmethod
     def _observe(self) -> Array:
@@ -167,10 +179,7 @@ class BulletEnv(gym.Env[Array, Array]):
         action = np.asarray(action, dtype=np.float64)
         if action.shape != self._low.shape or not math.isfinite(np.abs(action).max()):
             raise ValueError(f"The action must be {self.action_space.shape} finite numbers, got {action}.")
-        self._actuate(np.minimum(np.maximum(action, self._low), self._high))
-        self._hold_locked_joints()
-        for _ in range(self.physics_steps):
-            pybullet.stepSimulation(physicsClientId=self._client)
+        self._simulate(np.minimum(np.maximum(action, self._low), self._high))
         previous, self._obs = self._obs, self._observe()
         reward = float(self.reward_fn(previous, action, self._obs))
         return self._obs.copy(), reward, self._has_ended(self._obs), False, self._info()
@@ -229,7 +238,7 @@ class BulletEnv(gym.Env[Array, Array]):
             physicsClientId=client,
         )
         pybullet.setGravity(0.0, 0.0, -9.81, physicsClientId=client)
-        with as_file(files("famle_envs") / "assets" / self.asset) as path:
+        with as_file(self.asset_folder / self.asset) as path:
             self._robot = self._load_robot(str(path), client)
         self.joint_limits = self._read_joint_limits()
         self._colours = {

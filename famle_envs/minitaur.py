@@ -1,0 +1,161 @@
+"""A four-legged robot of eight direct-drive motors that has to learn to walk (the paper's section V-D)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from importlib.resources import files
+from itertools import product
+from typing import Any, ClassVar
+
+import numpy as np
+import pybullet
+from gymnasium import spaces
+
+from famle_envs.bullet_env import Array
+from famle_envs.gait_env import GaitEnv, wrapped
+from famle_envs.reality import SIMULATOR, Profile
+from famle_envs.situation import Situation
+
+__all__ = ["REALITY", "MinitaurEnv"]
+
+_MOTORS = (23, 20, 17, 14, 1, 4, 7, 10)  # PyBullet's indices: right and left motor of each leg
+_KNEE_OF_MOTOR = 2  # its index beyond the motor's
+_LEG_SIDE = np.array([-1.0, -1.0, 1.0, 1.0])  # sense in which both motors of a leg lengthen it
+_REST = math.pi / 2  # of a motor: the leg is half extended (rad)
+_KNEE_AT_REST = 2.18
+_FULL_SWING = 1.2  # of a leg, where the gait says 1 (rad)
+_FULL_LIFT = 1.0  # of both motors of a leg, where the gait says 1 (rad)
+_CLOSURE = ((0.0, 0.005, 0.2), (0.0, 0.01, 0.2))  # where the two shanks of a leg meet, in the frame of each (m)
+_START_HEIGHT = 0.19
+_FALLEN_TILT = math.cos(math.radians(50))
+
+REALITY = Profile(
+    name="reality",
+    motor_strength=0.6,
+    motor_speed=0.8,
+    joint_damping=0.02,
+    zero_errors=(0.08, -0.05, -0.1, 0.03, 0.06, 0.1, -0.04, 0.07),
+    backlash=0.02,
+    latency=0.03,
+    base_mass=1.3,
+    leg_mass=1.15,
+    floor_friction=0.4,
+    contact_stiffness=10_000.0,
+    contact_damping=100.0,
+    position_noise=0.01,
+    orientation_noise=0.02,
+)
+"""The Minitaur outside the simulator."""
+
+_TRAINING = (
+    Situation(name="intact"),
+    *(
+        Situation(friction=friction, base_mass=mass)
+        for friction, mass in product((1.0, 0.5, 2.0), (1.0, 1.5, 2.0))
+        if (friction, mass) != (1.0, 1.0)
+    ),
+)
+
+
+class MinitaurEnv(GaitEnv):
+    """``FamleMinitaur-v0``: PyBullet's model of the Minitaur, one gait a second.
+
+    Each leg is a closed loop of four bars driven by two motors; motors are counted leg by leg: back left, front left,
+    front right, back right.
+
+    ## Action
+    (4,) in [-1, 1]: steer (right where positive), step (forwards where positive), extension and offset of the lift;
+    see :func:`famle_envs.gaits.trot`. At full step a leg swings by 0.6 rad to either side.
+
+    ## Observation
+    (6,): position of the body in m; its roll, pitch and yaw in rad, in [-pi, pi].
+
+    ## Reward
+    Metres walked along the world's x axis.
+
+    ## Episode
+    60 actions. It ends where the robot has fallen (tilted by 50 degrees).
+
+    ## Situations
+    ``friction`` and ``base_mass``, ``locked_joints`` (held at their angle at rest) and ``orientation_error``.
+    :attr:`training_situations` holds the paper's nine: friction x {0.5, 1, 2} and base mass x {1, 1.5, 2}.
+
+    Args:
+        profile: See :class:`GaitEnv`.
+        situation: See :class:`BulletEnv`.
+        render_mode: See :class:`BulletEnv`.
+
+    Example:
+        >>> import gymnasium as gym, famle_envs
+        >>> env = gym.make("FamleMinitaur-v0", situation="friction x 0.5, base mass x 1.5")
+        >>> obs, info = env.reset(seed=0)
+        >>> obs.shape
+        (6,)
+        >>> env.close()
+    """
+
+    asset_folder = files("pybullet_data")
+    asset = "quadruped/minitaur.urdf"
+    joints = _MOTORS
+    floor_friction = 1.0
+    motor_torque = 5.0
+    motor_speed = 6.0
+    position_gain = 0.05
+    rest_angles = _REST * np.repeat(_LEG_SIDE, 2)
+    profiles: ClassVar[Mapping[str, Profile]] = {REALITY.name: REALITY}
+    position_dims = (0, 1)
+    angle_dims = (3, 4, 5)
+    training_situations = _TRAINING
+    presets: ClassVar[Mapping[str, Situation]] = {situation.label: situation for situation in _TRAINING}
+
+    def __init__(
+        self,
+        *,
+        profile: Profile | str = SIMULATOR,
+        situation: Situation | Mapping[str, Any] | str | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        high = np.array([np.inf, np.inf, np.inf, np.pi, np.pi, np.pi], dtype=np.float32)
+        self.observation_space = spaces.Box(-high, high)
+        super().__init__(profile=profile, situation=situation, render_mode=render_mode)
+
+    def reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
+        """x' - x of each transition.
+
+        Args:
+            obs: Observations, (..., 6); a NumPy array or a torch tensor.
+            action: Actions, (..., 4). Not used.
+            next_obs: Observations one gait later, (..., 6).
+
+        Returns:
+            Rewards in m, (...), in the type of ``next_obs``.
+        """
+        return next_obs[..., 0] - obs[..., 0]
+
+    def _joint_targets(self, swing: Array, lift: Array) -> Array:
+        length = _LEG_SIDE * (_REST - _FULL_LIFT * lift)
+        forwards = -_FULL_SWING * swing
+        return np.stack([length + forwards, length - forwards], axis=2).reshape(len(swing), len(_MOTORS))
+
+    def _observe(self) -> Array:
+        position, angles = self._measured_pose()
+        return np.array((*position, *(wrapped(angle) for angle in angles)), dtype=np.float32)
+
+    def _has_ended(self, obs: Array) -> bool:
+        _, quaternion = pybullet.getBasePositionAndOrientation(self._robot, physicsClientId=self._world)
+        return pybullet.getMatrixFromQuaternion(quaternion)[8] < _FALLEN_TILT
+
+    def _place_robot(self, path: str, client: int) -> int:
+        robot = pybullet.loadURDF(path, (0.0, 0.0, _START_HEIGHT), physicsClientId=client)
+        for motor, angle in zip(self.joints, self.rest_angles.tolist(), strict=True):
+            knee = motor + _KNEE_OF_MOTOR
+            pybullet.resetJointState(robot, motor, angle, physicsClientId=client)
+            pybullet.resetJointState(robot, knee, -math.copysign(_KNEE_AT_REST, angle), physicsClientId=client)
+            # A joint has a motor of its own, which would brake the knee.
+            pybullet.setJointMotorControl2(robot, knee, pybullet.VELOCITY_CONTROL, force=0.0, physicsClientId=client)
+        for right, left in zip(self.joints[::2], self.joints[1::2], strict=True):
+            knees = (robot, right + _KNEE_OF_MOTOR, robot, left + _KNEE_OF_MOTOR)
+            free_axis, kind = (0.0, 0.0, 0.0), pybullet.JOINT_POINT2POINT
+            pybullet.createConstraint(*knees, kind, free_axis, *_CLOSURE, physicsClientId=client)
+        return int(robot)

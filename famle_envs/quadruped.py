@@ -1,0 +1,195 @@
+"""A four-legged robot of twelve joints that has to reach a goal (the paper's section V-C)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import pybullet
+from gymnasium import spaces
+
+from famle_envs.bullet_env import Array
+from famle_envs.gait_env import GaitEnv
+from famle_envs.reality import SIMULATOR, Profile
+from famle_envs.situation import Situation
+
+__all__ = ["LEGS", "REALITY", "QuadrupedEnv"]
+
+LEGS = ("back left", "front left", "front right", "back right")
+_JOINTS_OF_A_LEG = 3
+_N_JOINTS = _JOINTS_OF_A_LEG * len(LEGS)
+_FULL_SWING = math.pi / 4  # of a joint, where the gait says 1 (rad)
+_BACKWARDS = np.array([1.0, 1.0, -1.0, -1.0])  # sense in which a hip turns its leg backwards
+_START_HEIGHT = 0.142
+
+REALITY = Profile(
+    name="reality",
+    motor_strength=0.03,
+    motor_speed=0.4,
+    joint_damping=0.02,
+    zero_errors=(0.15, -0.08, 0.12, -0.12, 0.09, -0.15, 0.08, 0.15, -0.09, 0.18, -0.12, 0.08),
+    backlash=0.03,
+    latency=0.05,
+    base_mass=1.4,
+    leg_mass=1.15,
+    floor_friction=0.4,
+    contact_stiffness=5000.0,
+    contact_damping=50.0,
+    position_noise=0.01,
+    orientation_noise=0.03,
+)
+"""The quadruped outside the simulator."""
+
+
+def blocked_leg(leg: int) -> Situation:
+    """The situation of a leg that is blocked, counted as in :data:`LEGS`."""
+    joints = range(_JOINTS_OF_A_LEG * leg, _JOINTS_OF_A_LEG * (leg + 1))
+    return Situation(locked_joints=tuple(joints), name=f"{LEGS[leg]} leg blocked")
+
+
+_TRAINING = (
+    Situation(name="intact"),
+    *(Situation(locked_joints=(joint,), name=f"joint {joint} locked") for joint in range(_N_JOINTS)),
+    *(
+        Situation(orientation_error=math.radians(degrees), name=f"yaw sensor off by {degrees} deg")
+        for degrees in range(45, 360, 45)
+    ),
+)
+
+
+class QuadrupedEnv(GaitEnv):
+    """``FamleQuadruped-v0``: a trunk of 0.24 m on four legs of three servos each, one gait a second.
+
+    A leg has a hip that turns about the vertical and two joints that lift the foot; joints are counted leg by leg, in
+    the order of :data:`LEGS`.
+
+    ## Action
+    (4,) in [-1, 1]: steer (right where positive), step (forwards where positive), extension and offset of the lift;
+    see :func:`famle_envs.gaits.trot`. At full step the robot walks about 0.25 m in a second.
+
+    ## Observation
+    (4,): x and y in m, sine and cosine of the measured yaw.
+
+    ## Reward
+    Metres by which the measured distance to the goal has become less.
+
+    ## Episode
+    It ends within ``success_radius`` of the goal, ``info["is_success"]``, or after 80 actions.
+
+    ## Situations
+    ``locked_joints`` (held at their angle at rest), ``orientation_error``, ``friction`` and ``base_mass``.
+    :attr:`training_situations` holds 20: intact, each joint blocked, and seven errors of the yaw.
+
+    Args:
+        goal: x and y in m; the robot starts at the origin and looks along +x.
+        success_radius: Distance from the goal that counts as reaching it, in m.
+        profile: See :class:`GaitEnv`.
+        situation: See :class:`BulletEnv`.
+        render_mode: See :class:`BulletEnv`.
+
+    Raises:
+        ValueError: The goal is not two finite numbers, or the radius is not above 0; and as :class:`GaitEnv`.
+
+    Example:
+        >>> import gymnasium as gym, famle_envs
+        >>> env = gym.make("FamleQuadruped-v0", situation="front left leg blocked", profile="reality")
+        >>> obs, info = env.reset(seed=0)
+        >>> info["is_success"]
+        False
+        >>> env.close()
+    """
+
+    asset = "quadruped.urdf"
+    joints = tuple(range(_N_JOINTS))
+    floor_friction = 1.0
+    motor_torque = 30.0
+    motor_speed = 7.0
+    rest_angles = np.zeros(_N_JOINTS)
+    profiles: ClassVar[Mapping[str, Profile]] = {REALITY.name: REALITY}
+    position_dims = (0, 1)
+    training_situations = _TRAINING
+    presets: ClassVar[Mapping[str, Situation]] = {
+        situation.name: situation for situation in (*_TRAINING, *(blocked_leg(leg) for leg in range(len(LEGS))))
+    }
+
+    def __init__(
+        self,
+        *,
+        goal: tuple[float, float] = (2.5, 0.0),
+        success_radius: float = 0.25,
+        profile: Profile | str = SIMULATOR,
+        situation: Situation | Mapping[str, Any] | str | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        self.goal = finite_point("goal", goal)
+        if not isinstance(success_radius, (int, float)) or not 0.0 < success_radius < math.inf:
+            raise ValueError(f"success_radius must be a number of metres above 0, got {success_radius!r}.")
+        self.success_radius = float(success_radius)
+        high = np.array([np.inf, np.inf, 1.0, 1.0], dtype=np.float32)
+        self.observation_space = spaces.Box(-high, high)
+        super().__init__(profile=profile, situation=situation, render_mode=render_mode)
+
+    def reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
+        """|p - goal| - |p' - goal| of each transition.
+
+        Args:
+            obs: Observations, (..., 4); a NumPy array or a torch tensor.
+            action: Actions, (..., 4). Not used.
+            next_obs: Observations one gait later, (..., 4).
+
+        Returns:
+            Rewards in m, (...), in the type of ``next_obs``.
+        """
+        return self._distance(obs) - self._distance(next_obs)
+
+    def _distance(self, obs: Any) -> Any:
+        dx, dy = obs[..., 0] - self.goal[0], obs[..., 1] - self.goal[1]
+        return (dx * dx + dy * dy) ** 0.5
+
+    def _joint_targets(self, swing: Array, lift: Array) -> Array:
+        legs = np.stack([_BACKWARDS * swing, lift, lift], axis=2)
+        return _FULL_SWING * legs.reshape(len(swing), _N_JOINTS)
+
+    def _observe(self) -> Array:
+        (x, y, _), (_, _, yaw) = self._measured_pose()
+        return np.array((x, y, math.sin(yaw), math.cos(yaw)), dtype=np.float32)
+
+    def _is_success(self) -> bool:
+        x, y, _ = self.position
+        return math.hypot(x - self.goal[0], y - self.goal[1]) < self.success_radius
+
+    def _has_ended(self, obs: Array) -> bool:
+        return self._is_success()
+
+    def _info(self) -> dict[str, Any]:
+        return {**super()._info(), "is_success": self._is_success()}
+
+    def _place_robot(self, path: str, client: int) -> int:
+        if self.render_mode is not None:
+            ring = pybullet.createVisualShape(
+                pybullet.GEOM_CYLINDER,
+                radius=self.success_radius,
+                length=0.002,
+                rgbaColor=(0.15, 0.65, 0.3, 1.0),
+                physicsClientId=client,
+            )
+            pybullet.createMultiBody(baseVisualShapeIndex=ring, basePosition=(*self.goal, 0.0), physicsClientId=client)
+        flags = pybullet.URDF_USE_INERTIA_FROM_FILE
+        return int(pybullet.loadURDF(path, (0.0, 0.0, _START_HEIGHT), flags=flags, physicsClientId=client))
+
+
+def finite_point(name: str, value: Any) -> tuple[float, float]:
+    """x and y.
+
+    Raises:
+        ValueError: It is not two finite numbers.
+    """
+    try:
+        point = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        point = np.empty(0)
+    if point.shape != (2,) or not np.isfinite(point).all():
+        raise ValueError(f"{name} must be two finite numbers, x and y in m, got {value!r}.")
+    return float(point[0]), float(point[1])

@@ -1,0 +1,78 @@
+"""How a test robot differs from every simulator that an agent is trained in.
+
+A profile is fixed before any result of an agent on it is looked at, and no agent meta-learns or is tuned on one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+__all__ = ["SIMULATOR", "Profile", "resolve_profile"]
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The body behind the situation: what a real robot has and the default simulator has not.
+
+    Attributes:
+        name: What to call it.
+        motor_strength: Factor on the torque at which a motor saturates.
+        motor_speed: Factor on a joint's greatest speed.
+        joint_damping: Added to each joint, in N m s/rad.
+        zero_errors: By how much each joint stands off the angle that its servo reports, in rad; none where it is empty.
+        backlash: Play of the gears between motor and joint, in rad to either side.
+        latency: Delay of the joint commands, in s.
+        base_mass: Factor on the mass and the inertia of the base.
+        leg_mass: Factor on those of all other links.
+        floor_friction: Factor on the floor's friction.
+        contact_stiffness: Of the floor, in N/m; 0 is rigid.
+        contact_damping: Of the floor, in N s/m.
+        position_noise: Deviation of measured positions, in m.
+        orientation_noise: Deviation of measured angles of the body, in rad.
+    """
+
+    name: str = "simulator"
+    motor_strength: float = 1.0
+    motor_speed: float = 1.0
+    joint_damping: float = 0.0
+    zero_errors: tuple[float, ...] = ()
+    backlash: float = 0.0
+    latency: float = 0.0
+    base_mass: float = 1.0
+    leg_mass: float = 1.0
+    floor_friction: float = 1.0
+    contact_stiffness: float = 0.0
+    contact_damping: float = 0.0
+    position_noise: float = 0.0
+    orientation_noise: float = 0.0
+
+    @property
+    def is_simulator(self) -> bool:
+        """Whether agents may be trained on it."""
+        return self.name == SIMULATOR.name
+
+    def __str__(self) -> str:
+        differs = {key: value for key, value in vars(self).items() if key != "name" and value != getattr(SIMULATOR, key)}
+        return f"{self.name}: {', '.join(f'{key} {value}' for key, value in differs.items())}" if differs else self.name
+
+
+SIMULATOR = Profile()
+
+
+def resolve_profile(profile: Profile | str, known: Mapping[str, Profile]) -> Profile:
+    """A profile, be it given or named.
+
+    Raises:
+        TypeError: It is neither a profile nor a name.
+        ValueError: A robot has no profile of that name.
+    """
+    if isinstance(profile, Profile):
+        return profile
+    if not isinstance(profile, str):
+        raise TypeError(f"profile must be a Profile or a name, got {type(profile).__name__}.")
+    profiles: dict[str, Any] = {SIMULATOR.name: SIMULATOR, **known}
+    if profile not in profiles:
+        raise ValueError(f"There is no profile {profile!r}. Profiles: {', '.join(profiles)}.")
+    return profiles[profile]  # type: ignore[no-any-return]
