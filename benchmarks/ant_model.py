@@ -113,7 +113,7 @@ def errors(model: Dynamics, belief: Belief, data: Transitions, first: int) -> di
 def _towards(predicted: Tensor, true: Tensor, model: Dynamics) -> Tensor:
     """Of q and -q, the same orientation, the nearer one."""
     predicted = predicted.clone()
-    q = model.quaternion_dims
+    q = model.layout.quaternion_dims
     sign = torch.where((predicted[..., q] * true[..., q]).sum(dim=-1, keepdim=True) < 0.0, -1.0, 1.0)
     predicted[..., q] *= sign
     return predicted

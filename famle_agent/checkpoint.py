@@ -21,6 +21,7 @@ from torch import Tensor
 
 from famle_agent.envs import make_env
 from famle_agent.hyperparameters import Hyperparameters
+from famle_agent.observation import DIMS
 from famle_agent.online import OnlineState
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ _DAMAGE = (
     *(zipfile.BadZipFile, zlib.error, EOFError, KeyError, SafetensorError),
     *(ValueError, RuntimeError, NotImplementedError),  # what zipfile and json make of flipped bits
 )
+_NO_MATTER_TO_A_MODEL = ("situation", "profile", "goal", "success_radius", "terminate_when_fallen", "render_mode")
 _META, _TENSORS = "agent.json", "tensors.safetensors"
 
 Agent = TypeVar("Agent", bound="ModelBasedAgent")
@@ -109,8 +111,7 @@ def save_agent(agent: ModelBasedAgent, file: File) -> None:
         "hyperparameters": agent.hyperparameters.to_dict(),
         "observation_space": _box_to_json(agent.observation_space),
         "action_space": _box_to_json(agent.action_space),
-        "angle_dims": list(agent._angle_dims),
-        "quaternion_dims": list(agent._quaternion_dims),
+        **{name: list(dims) for name, dims in agent._dims.items()},
         "situations": list(agent.situations),
         "env": agent._env_spec,
         "needs_reward_fn": agent._reward_fn is not None,
@@ -142,7 +143,7 @@ def load_agent(
         situations = tuple(str(name) for name in list(meta["situations"]))
         settings = Hyperparameters.from_dict(meta["hyperparameters"]).to_dict()
         mode, seed, live = meta["mode"], meta["seed"], meta["live"]
-        dims = {name: tuple(meta[name]) for name in ("angle_dims", "quaternion_dims")}
+        dims = {name: tuple(meta.get(name, ())) for name in DIMS}
         needs_reward_fn, named_env = meta["needs_reward_fn"], meta["env"]
         env = _named_env(named_env) if env is None else env
     except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -188,7 +189,7 @@ def load_pretrained(agent: ModelBasedAgent, file: File) -> None:
     meta, tensors = read_checkpoint(file)
     alike = (
         meta["class"] == type(agent).__name__
-        and all(meta[name] == list(getattr(agent, f"_{name}")) for name in ("angle_dims", "quaternion_dims"))
+        and all(tuple(meta.get(name, ())) == dims for name, dims in agent._dims.items())
         and _world(meta["env"]) == _world(agent._env_spec)
         and Hyperparameters.from_dict(meta["hyperparameters"]).learnt_alike(agent.hyperparameters)
     )
@@ -202,7 +203,7 @@ def _world(env: dict[str, Any] | None) -> dict[str, Any] | None:
     """What of an environment's description matters to a model of all its situations."""
     if env is None:
         return None
-    kwargs = {key: value for key, value in env["kwargs"].items() if key not in ("situation", "render_mode")}
+    kwargs = {key: value for key, value in env["kwargs"].items() if key not in _NO_MATTER_TO_A_MODEL}
     return {"id": env["id"], "kwargs": kwargs}
 
 

@@ -11,11 +11,13 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations_with_replacement, pairwise
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own custom)
+
+from famle_agent.observation import ObservationLayout
 
 __all__ = ["Batch", "Dynamics", "Network", "Simulator", "Theta", "expand"]
 
@@ -54,10 +56,9 @@ def expand(theta: Theta, size: int) -> Theta:
 class Dynamics(nn.Module):
     """Gaussian or Student-t p(s' | s, a, h): a network predicts the normalised change of the state.
 
-    Angles enter as sine and cosine, and their change is taken the short way round, so that a jump from pi to
-    -pi is no event. A quaternion q enters as the products q_i q_j, in which a rotation is linear and q and -q are
-    the same. The embedding h enters the first layer as a bias, which is what concatenating it to the
-    input amounts to. With ``gate_actions``, it scales each action too,
+    What the network sees of an observation, :class:`~famle_agent.observation.ObservationLayout` says. The embedding h
+    enters the first layer as a bias, which is what concatenating it to the input amounts to. With ``gate_actions``, it
+    scales each action too,
 
         a' = (1 + G^T h) * a,
 
@@ -76,6 +77,7 @@ class Dynamics(nn.Module):
         hidden: Width of each hidden layer.
         angle_dims: Observation dimensions that are angles in rad.
         quaternion_dims: The four observation dimensions of a unit quaternion, or none.
+        position_dims: Observation dimensions on which the dynamics does not depend.
         gate_actions: Whether the embedding scales the actions; False is the paper's network.
         interaction_rank: R; 0 is the paper's network.
         members: P, independent networks with embeddings of their own; 1 is the paper's.
@@ -102,6 +104,7 @@ class Dynamics(nn.Module):
         hidden: Sequence[int] = (70, 50),
         angle_dims: Sequence[int] = (),
         quaternion_dims: Sequence[int] = (),
+        position_dims: Sequence[int] = (),
         gate_actions: bool = True,
         interaction_rank: int = 0,
         members: int = 1,
@@ -111,11 +114,8 @@ class Dynamics(nn.Module):
         self.obs_dim, self.action_dim = obs_dim, action_dim
         self.gate_actions, self.interaction_rank = gate_actions, interaction_rank
         self.degrees_of_freedom = degrees_of_freedom
-        self.angle_dims, self.quaternion_dims = list(angle_dims), list(quaternion_dims)
-        special = {*angle_dims, *quaternion_dims}
-        self.other_dims = [dim for dim in range(obs_dim) if dim not in special]
-        self.quaternion_pairs = list(combinations_with_replacement(range(len(self.quaternion_dims)), 2))
-        self.n_features = len(self.other_dims) + 2 * len(self.angle_dims) + len(self.quaternion_pairs)
+        self.layout = ObservationLayout(obs_dim, tuple(angle_dims), tuple(quaternion_dims), tuple(position_dims))
+        self.n_features = self.layout.n_features
         self.n_layers = len(hidden) + 1
 
         sizes = [self.n_features + action_dim, *hidden, obs_dim]
@@ -176,30 +176,12 @@ class Dynamics(nn.Module):
     # --- data -------------------------------------------------------------------------------------------
 
     def features(self, obs: Tensor) -> Tensor:
-        """What the network sees of observations (..., obs_dim): sine and cosine of angles, products of quaternions."""
-        if not self.angle_dims and not self.quaternion_dims:
-            return obs
-        parts = [obs[..., self.other_dims]]
-        if self.angle_dims:
-            angles = obs[..., self.angle_dims]
-            parts += [angles.sin(), angles.cos()]
-        if self.quaternion_dims:
-            q = obs[..., self.quaternion_dims]
-            left, right = zip(*self.quaternion_pairs, strict=True)
-            parts.append(q[..., left] * q[..., right])
-        return torch.cat(parts, dim=-1)
+        """What the network sees of observations, (..., obs_dim) -> (..., n_features)."""
+        return self.layout.features(obs)
 
     def targets(self, obs: Tensor, next_obs: Tensor) -> Tensor:
-        """The change of the state, angles and quaternions the short way round."""
-        change = next_obs - obs
-        if self.angle_dims:
-            angle = change[..., self.angle_dims]
-            change[..., self.angle_dims] = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
-        if self.quaternion_dims:
-            q, q_next = obs[..., self.quaternion_dims], next_obs[..., self.quaternion_dims]
-            nearer = torch.where((q * q_next).sum(dim=-1, keepdim=True) < 0.0, -q_next, q_next)
-            change[..., self.quaternion_dims] = nearer - q
-        return change
+        """The change of the state, (..., obs_dim)."""
+        return self.layout.change(obs, next_obs)
 
     def fit_normalisation(self, obs: Tensor, next_obs: Tensor) -> None:
         """Takes means and deviations over all leading axes of the data."""
@@ -326,24 +308,12 @@ class Simulator:
         (first_weight, first_bias), (last_weight, last_bias) = network[0], network[-1]
         from_features = first_weight[:, : model.n_features] / model.input_std[:, None]
         bias = first_bias - (model.input_mean @ from_features)[:, None]
-        first = torch.cat([self._from_inputs(from_features), first_weight[:, model.n_features :]], dim=1), bias
+        first = (
+            torch.cat([model.layout.weights_for_inputs(from_features), first_weight[:, model.n_features :]], dim=1),
+            bias,
+        )
         last = (last_weight * model.target_std, last_bias * model.target_std + model.target_mean)
         self._network = [first, *network[1:-1], last]
-
-    def _from_inputs(self, from_features: Tensor) -> Tensor:
-        """First-layer weights for the inputs of :meth:`__call__`, which copy as little as possible.
-
-        All of the observation goes in, with weights of 0 for what enters otherwise; and all 16 products of a
-        quaternion instead of the 10 that differ.
-        """
-        model = self._model
-        n_other, n_angles = len(model.other_dims), len(model.angle_dims)
-        other, angles, products = from_features.tensor_split([n_other, n_other + 2 * n_angles], dim=1)
-        plain = from_features.new_zeros(len(from_features), model.obs_dim, from_features.shape[2])
-        plain[:, model.other_dims] = other
-        square = from_features.new_zeros(len(from_features), len(model.quaternion_dims) ** 2, from_features.shape[2])
-        square[:, [4 * i + j for i, j in model.quaternion_pairs]] = products
-        return torch.cat([plain, angles, square], dim=1)
 
     def __call__(self, obs: Tensor, action: Tensor) -> Tensor:
         """Predicts the next observations, (B, n, obs_dim), angles not wrapped.
@@ -352,22 +322,9 @@ class Simulator:
             obs: Observations, (B, n, obs_dim).
             action: Actions in [-1, 1], (B, n, action_dim).
         """
-        parts = [obs]
-        if self._model.angle_dims:
-            angles = _take(obs, self._model.angle_dims)
-            parts += [angles.sin(), angles.cos()]
-        if self._model.quaternion_dims:
-            q = _take(obs, self._model.quaternion_dims)
-            parts.append((q[..., None] * q[..., None, :]).flatten(-2))
-        change = self._model.forward(self._network, torch.cat([*parts, action], dim=-1))
+        inputs = torch.cat([self._model.layout.inputs(obs), action], dim=-1)
+        change = self._model.forward(self._network, inputs)
         return change.add_(obs) if not change.requires_grad else change + obs
-
-
-def _take(values: Tensor, dims: list[int]) -> Tensor:
-    """Some of the last dimensions; a view where they follow each other."""
-    if dims == list(range(dims[0], dims[-1] + 1)):
-        return values[..., dims[0] : dims[-1] + 1]
-    return values[..., dims]
 
 
 def _rows(h: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from famle_agent.hyperparameters import known_robots
 from famle_agent.planning import RewardFn
 from famle_agent.policies import REWARDS
 from famle_agent.transitions import EnvSource
+from famle_envs.reality import Profile
 from famle_envs.situation import Situation
 
 __all__ = [
@@ -111,8 +112,8 @@ def situation_envs(env: VecEnv, envs: Sequence[EnvLike] | None) -> SituationEnvs
         envs: What the user gave; None takes the training situations that the environment names.
 
     Raises:
-        ValueError: No situation is given or known, the environment takes no ``situation``, or the spaces of one differ
-            from the agent's.
+        ValueError: No situation is given or known, the environment takes no ``situation``, the spaces of one differ
+            from the agent's, or one has a profile other than the simulator's.
     """
     if envs is None:
         envs = list(env_attribute(env, "training_situations", ()))
@@ -128,6 +129,7 @@ def situation_envs(env: VecEnv, envs: Sequence[EnvLike] | None) -> SituationEnvs
         made = source if isinstance(source, gym.Env) else source()
         try:
             _check_same_spaces(made, env)
+            _check_simulated(made)
             situation = _get(made, "situation", None)
         finally:
             if made is not source:
@@ -171,6 +173,15 @@ def _check_same_spaces(made: gym.Env[Any, Any], env: VecEnv) -> None:
         raise ValueError(
             f"Each situation must have the agent's spaces, {env.observation_space} and {env.action_space}; "
             f"got {made.observation_space} and {made.action_space}."
+        )
+
+
+def _check_simulated(made: gym.Env[Any, Any]) -> None:
+    profile = _get(made, "profile", None)
+    if isinstance(profile, Profile) and not profile.is_simulator:
+        raise ValueError(
+            f"The profile {profile.name!r} stands for the robot that an agent is made for, and no agent meta-learns on "
+            "it. Meta-learn on environments without a profile, then run the agent on this one."
         )
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
+
+from famle_agent.observation import ObservationLayout
 
 __all__ = ["LearnedReward"]
 
@@ -14,8 +16,7 @@ class LearnedReward(nn.Module):
     """r(s, a, s') as a network of its own, since a situation changes the dynamics and never the task.
 
     Args:
-        features: The dynamics model's view of observations, (..., obs_dim) -> (..., n_features).
-        n_features: Its size.
+        layout: Of the observations. Positions count here: a goal has a place.
         action_dim: Number of action dimensions.
         width: Width of the two hidden layers.
     """
@@ -25,12 +26,10 @@ class LearnedReward(nn.Module):
     reward_mean: Tensor
     reward_std: Tensor
 
-    def __init__(
-        self, features: Callable[[Tensor], Tensor], n_features: int, action_dim: int, width: int = 128
-    ) -> None:
+    def __init__(self, layout: ObservationLayout, action_dim: int, width: int = 128) -> None:
         super().__init__()
-        self._features = features
-        inputs = 2 * n_features + action_dim
+        self._layout = replace(layout, position_dims=())
+        inputs = 2 * self._layout.n_features + action_dim
         self.layers = nn.Sequential(
             nn.Linear(inputs, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 1)
         )
@@ -73,4 +72,4 @@ class LearnedReward(nn.Module):
         self.requires_grad_(False)
 
     def _inputs(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
-        return torch.cat([self._features(obs), action, self._features(next_obs)], dim=-1)
+        return torch.cat([self._layout.features(obs), action, self._layout.features(next_obs)], dim=-1)

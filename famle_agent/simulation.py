@@ -37,6 +37,7 @@ from famle_agent.envs import (
 )
 from famle_agent.errors import NotLearnedError
 from famle_agent.hyperparameters import Hyperparameters, robot_of
+from famle_agent.observation import DIMS
 from famle_agent.planning import RewardFn
 from famle_agent.policies import MakePolicy, make_held_uniform, make_planning
 from famle_agent.reward import LearnedReward
@@ -66,6 +67,8 @@ class SimulationLearner(BaseAlgorithm):
         angle_dims: Observation dimensions that are angles in rad. None takes the environment's ``angle_dims``.
         quaternion_dims: The four observation dimensions of a unit quaternion, or none of them. None takes the
             environment's ``quaternion_dims``.
+        position_dims: Observation dimensions on which the dynamics does not depend, as where on the floor a robot is.
+            None takes the environment's ``position_dims``.
         tensorboard_log: Folder for TensorBoard; None logs nothing there.
         verbose: 0 for silence, 1 for information, 2 for debugging.
         device: ``"auto"``, ``"cpu"`` or ``"cuda"``.
@@ -96,6 +99,7 @@ class SimulationLearner(BaseAlgorithm):
         reward_fn: RewardFn | None = None,
         angle_dims: Sequence[int] | None = None,
         quaternion_dims: Sequence[int] | None = None,
+        position_dims: Sequence[int] | None = None,
         tensorboard_log: str | None = None,
         verbose: int = 0,
         device: torch.device | str = "auto",
@@ -126,13 +130,7 @@ class SimulationLearner(BaseAlgorithm):
         self.hyperparameters = robot.hyperparameters(mode, **overrides)
         self._reward_fn = reward_fn
         self._learned_reward: LearnedReward | None = None
-        if angle_dims is None:
-            angle_dims = () if self.env is None else env_attribute(self.env, "angle_dims", ())
-        self._angle_dims = tuple(angle_dims)
-        if quaternion_dims is None:
-            quaternion_dims = () if self.env is None else env_attribute(self.env, "quaternion_dims", ())
-        self._quaternion_dims = tuple(quaternion_dims)
-        self._check_dims()
+        self._dims = self._dims_of(angle_dims, quaternion_dims, position_dims)
         self._generator = torch.Generator(self.device)
         self._setup_model()
         if pretrained and robot.pretrained is not None:
@@ -169,17 +167,20 @@ class SimulationLearner(BaseAlgorithm):
         self._env_spec = env_spec(env)
         self._env_reward_fn = planning_reward(env)
 
-    def _check_dims(self) -> None:
-        if len(self._quaternion_dims) not in (0, 4):
-            raise ValueError(f"quaternion_dims must name four dimensions or none, got {self._quaternion_dims}.")
-        dims = [*self._angle_dims, *self._quaternion_dims]
-        if len(set(dims)) < len(dims):
-            raise ValueError(f"angle_dims and quaternion_dims name a dimension twice: {dims}.")
-        if self.env is not None and any(not 0 <= dim < self.observation_space.shape[0] for dim in dims):
-            raise ValueError(
-                f"angle_dims {self._angle_dims} and quaternion_dims {self._quaternion_dims} name dimensions that "
-                f"{self.observation_space} has not."
-            )
+    def _dims_of(self, *given: Sequence[int] | None) -> dict[str, tuple[int, ...]]:
+        """The special dimensions of an observation by name: those that were given, else the environment's."""
+        dims = {}
+        for name, chosen in zip(DIMS, given, strict=True):
+            known = () if self.env is None else env_attribute(self.env, name, ())
+            dims[name] = tuple(known if chosen is None else chosen)
+        if len(dims["quaternion_dims"]) not in (0, 4):
+            raise ValueError(f"quaternion_dims must name four dimensions or none, got {dims['quaternion_dims']}.")
+        flat = [dim for some in dims.values() for dim in some]
+        if len(set(flat)) < len(flat):
+            raise ValueError(f"{', '.join(DIMS)} name a dimension twice: {dims}.")
+        if self.env is not None and any(not 0 <= dim < self.observation_space.shape[0] for dim in flat):
+            raise ValueError(f"{dims} name dimensions that {self.observation_space} has not.")
+        return dims
 
     @abstractmethod
     def _learn_model(
@@ -375,17 +376,16 @@ class SimulationLearner(BaseAlgorithm):
             n_situations,
             settings.embedding_dim,
             settings.hidden,
-            self._angle_dims,
-            self._quaternion_dims,
-            settings.gate_actions,
-            settings.interaction_rank,
-            settings.members,
-            settings.degrees_of_freedom,
+            **self._dims,
+            gate_actions=settings.gate_actions,
+            interaction_rank=settings.interaction_rank,
+            members=settings.members,
+            degrees_of_freedom=settings.degrees_of_freedom,
         ).to(self.device)
 
     def _new_reward(self) -> LearnedReward:
         model = self._require_dynamics()
-        return LearnedReward(model.features, model.n_features, model.action_dim).to(self.device)
+        return LearnedReward(model.layout, model.action_dim).to(self.device)
 
     def _known_reward_fn(self) -> RewardFn | None:
         """The user's reward function, or the environment's."""

@@ -10,6 +10,7 @@ import numpy as np
 import pybullet
 from gymnasium import spaces
 
+from famle_envs.arguments import number_within
 from famle_envs.bullet_env import Array, BulletEnv
 from famle_envs.situation import Situation
 
@@ -103,8 +104,7 @@ class AntEnv(BulletEnv):
         situation: Situation | Mapping[str, Any] | str | None = None,
         render_mode: str | None = None,
     ) -> None:
-        if not isinstance(control_rate, (int, float)) or not 50.0 <= control_rate <= 500.0:
-            raise ValueError(f"control_rate must be a number between 50 and 500 Hz, got {control_rate!r}.")
+        control_rate = number_within("control_rate", control_rate, 50.0, 500.0, "Hz")
         self.time_step = 1.0 / control_rate  # type: ignore[misc]  # each ant has a rate of its own
         self.metadata = {**self.metadata, "render_fps": round(control_rate)}
         self.terminate_when_fallen = terminate_when_fallen

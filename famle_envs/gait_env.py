@@ -82,7 +82,7 @@ class GaitEnv(BulletEnv):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """See :meth:`BulletEnv.reset`."""
         self._on_its_way = np.tile(self.rest_angles, (round(self.profile.latency / self.time_step), 1))
-        self._geared = self.rest_angles
+        self._geared: Array = self.rest_angles
         return super().reset(seed=seed, options=options)
 
     def _simulate(self, action: Array) -> None:
@@ -114,7 +114,8 @@ class GaitEnv(BulletEnv):
         gap = self.profile.backlash
         geared = np.empty_like(targets)
         for t, target in enumerate(targets):
-            self._geared = geared[t] = np.clip(self._geared, target - gap, target + gap)
+            self._geared = np.minimum(np.maximum(self._geared, target - gap), target + gap)
+            geared[t] = self._geared
         return geared
 
     def _measured_pose(self) -> tuple[list[float], list[float]]:

@@ -121,7 +121,7 @@ class MinitaurEnv(GaitEnv):
         super().__init__(profile=profile, situation=situation, render_mode=render_mode)
 
     def reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
-        """x' - x of each transition.
+        """The way along x of each transition, x' - x.
 
         Args:
             obs: Observations, (..., 6); a NumPy array or a torch tensor.
@@ -144,7 +144,7 @@ class MinitaurEnv(GaitEnv):
 
     def _has_ended(self, obs: Array) -> bool:
         _, quaternion = pybullet.getBasePositionAndOrientation(self._robot, physicsClientId=self._world)
-        return pybullet.getMatrixFromQuaternion(quaternion)[8] < _FALLEN_TILT
+        return bool(pybullet.getMatrixFromQuaternion(quaternion)[8] < _FALLEN_TILT)
 
     def _place_robot(self, path: str, client: int) -> int:
         robot = pybullet.loadURDF(path, (0.0, 0.0, _START_HEIGHT), physicsClientId=client)

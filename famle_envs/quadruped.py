@@ -10,6 +10,7 @@ import numpy as np
 import pybullet
 from gymnasium import spaces
 
+from famle_envs.arguments import finite_point, number_within
 from famle_envs.bullet_env import Array
 from famle_envs.gait_env import GaitEnv
 from famle_envs.reality import SIMULATOR, Profile
@@ -90,7 +91,7 @@ class QuadrupedEnv(GaitEnv):
         render_mode: See :class:`BulletEnv`.
 
     Raises:
-        ValueError: The goal is not two finite numbers, or the radius is not above 0; and as :class:`GaitEnv`.
+        ValueError: The goal or the radius is no length in m; and as :class:`GaitEnv`.
 
     Example:
         >>> import gymnasium as gym, famle_envs
@@ -124,9 +125,7 @@ class QuadrupedEnv(GaitEnv):
         render_mode: str | None = None,
     ) -> None:
         self.goal = finite_point("goal", goal)
-        if not isinstance(success_radius, (int, float)) or not 0.0 < success_radius < math.inf:
-            raise ValueError(f"success_radius must be a number of metres above 0, got {success_radius!r}.")
-        self.success_radius = float(success_radius)
+        self.success_radius = number_within("success_radius", success_radius, 0.01, 100.0, "m")
         high = np.array([np.inf, np.inf, 1.0, 1.0], dtype=np.float32)
         self.observation_space = spaces.Box(-high, high)
         super().__init__(profile=profile, situation=situation, render_mode=render_mode)
@@ -178,18 +177,3 @@ class QuadrupedEnv(GaitEnv):
             pybullet.createMultiBody(baseVisualShapeIndex=ring, basePosition=(*self.goal, 0.0), physicsClientId=client)
         flags = pybullet.URDF_USE_INERTIA_FROM_FILE
         return int(pybullet.loadURDF(path, (0.0, 0.0, _START_HEIGHT), flags=flags, physicsClientId=client))
-
-
-def finite_point(name: str, value: Any) -> tuple[float, float]:
-    """x and y.
-
-    Raises:
-        ValueError: It is not two finite numbers.
-    """
-    try:
-        point = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        point = np.empty(0)
-    if point.shape != (2,) or not np.isfinite(point).all():
-        raise ValueError(f"{name} must be two finite numbers, x and y in m, got {value!r}.")
-    return float(point[0]), float(point[1])

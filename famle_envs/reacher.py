@@ -10,6 +10,7 @@ import numpy as np
 import pybullet
 from gymnasium import spaces
 
+from famle_envs.arguments import finite_point
 from famle_envs.bullet_env import Array, BulletEnv
 from famle_envs.situation import Situation
 
@@ -88,13 +89,7 @@ class ReacherEnv(BulletEnv):
         situation: Situation | Mapping[str, Any] | str | None = None,
         render_mode: str | None = None,
     ) -> None:
-        try:
-            point = np.asarray(goal, dtype=np.float64)
-        except (TypeError, ValueError):
-            point = np.empty(0)
-        if point.shape != (2,) or not np.isfinite(point).all():
-            raise ValueError(f"goal must be two finite numbers, x and y in m, got {goal!r}.")
-        self.goal = (float(point[0]), float(point[1]))
+        self.goal = finite_point("goal", goal)
         reach = N_JOINTS * LINK_LENGTH
         high = np.array([math.pi] * N_JOINTS + [SENSED_SPEED] * N_JOINTS + [1.1 * reach] * 2, dtype=np.float32)
         self.observation_space = spaces.Box(-high, high)

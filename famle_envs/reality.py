@@ -54,8 +54,9 @@ class Profile:
         return self.name == SIMULATOR.name
 
     def __str__(self) -> str:
-        differs = {key: value for key, value in vars(self).items() if key != "name" and value != getattr(SIMULATOR, key)}
-        return f"{self.name}: {', '.join(f'{key} {value}' for key, value in differs.items())}" if differs else self.name
+        fields = {key: value for key, value in vars(self).items() if key != "name"}
+        differs = [f"{key} {value}" for key, value in fields.items() if value != getattr(SIMULATOR, key)]
+        return ": ".join([self.name, ", ".join(differs)]) if differs else self.name
 
 
 SIMULATOR = Profile()
