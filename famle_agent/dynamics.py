@@ -77,7 +77,7 @@ class Dynamics(nn.Module):
         hidden: Width of each hidden layer.
         angle_dims: Observation dimensions that are angles in rad.
         quaternion_dims: The four observation dimensions of a unit quaternion, or none.
-        position_dims: Observation dimensions on which the dynamics does not depend.
+        pose_dims: x, y and heading of a robot on a floor, or none.
         gate_actions: Whether the embedding scales the actions; False is the paper's network.
         interaction_rank: R; 0 is the paper's network.
         members: P, independent networks with embeddings of their own; 1 is the paper's.
@@ -104,7 +104,7 @@ class Dynamics(nn.Module):
         hidden: Sequence[int] = (70, 50),
         angle_dims: Sequence[int] = (),
         quaternion_dims: Sequence[int] = (),
-        position_dims: Sequence[int] = (),
+        pose_dims: Sequence[int] = (),
         gate_actions: bool = True,
         interaction_rank: int = 0,
         members: int = 1,
@@ -114,7 +114,7 @@ class Dynamics(nn.Module):
         self.obs_dim, self.action_dim = obs_dim, action_dim
         self.gate_actions, self.interaction_rank = gate_actions, interaction_rank
         self.degrees_of_freedom = degrees_of_freedom
-        self.layout = ObservationLayout(obs_dim, tuple(angle_dims), tuple(quaternion_dims), tuple(position_dims))
+        self.layout = ObservationLayout(obs_dim, tuple(angle_dims), tuple(quaternion_dims), tuple(pose_dims))
         self.n_features = self.layout.n_features
         self.n_layers = len(hidden) + 1
 
@@ -187,7 +187,7 @@ class Dynamics(nn.Module):
         """Takes means and deviations over all leading axes of the data."""
         for name, values in (("input", self.features(obs)), ("target", self.targets(obs, next_obs))):
             flat = values.flatten(0, -2)
-            std = flat.std(dim=0)
+            std = flat.std(dim=0) if flat.shape[1] else flat.mean(dim=0)  # a model may see no more than the actions
             # A dimension that never varies carries nothing and must not be blown up.
             getattr(self, f"{name}_std").copy_(torch.where(std > 1e-6, std, 1.0))
             getattr(self, f"{name}_mean").copy_(flat.mean(dim=0))
@@ -324,7 +324,7 @@ class Simulator:
         """
         inputs = torch.cat([self._model.layout.inputs(obs), action], dim=-1)
         change = self._model.forward(self._network, inputs)
-        return change.add_(obs) if not change.requires_grad else change + obs
+        return self._model.layout.advance(obs, change)
 
 
 def _rows(h: Tensor) -> Tensor:

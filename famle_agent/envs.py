@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain, count
 from typing import Any
@@ -75,12 +75,19 @@ def env_spec(env: VecEnv) -> dict[str, Any] | None:
     spec = _plain_spec(env)
     if spec is None:
         return None
-    kwargs = {key: value.to_dict() if isinstance(value, Situation) else value for key, value in spec.kwargs.items()}
+    kwargs = {key: _plain(value) for key, value in spec.kwargs.items()}
     try:
         json.dumps(kwargs)
     except TypeError:  # an argument that no file can name
         return None
     return {"id": spec.id, "kwargs": kwargs}
+
+
+def _plain(value: Any) -> Any:
+    """An argument as JSON types, where it is one of ours."""
+    if isinstance(value, Situation):
+        return value.to_dict()
+    return asdict(value) if isinstance(value, Profile) else value
 
 
 def _plain_spec(env: VecEnv) -> EnvSpec | None:

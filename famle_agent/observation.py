@@ -11,7 +11,7 @@ from torch import Tensor
 
 __all__ = ["DIMS", "ObservationLayout"]
 
-DIMS = ("angle_dims", "quaternion_dims", "position_dims")
+DIMS = ("angle_dims", "quaternion_dims", "pose_dims")
 """What an environment may say about its observation, by the names of its attributes."""
 
 
@@ -21,24 +21,42 @@ class ObservationLayout:
 
     Angles enter a model as sine and cosine, and their change is taken the short way round, so that a jump from pi to
     -pi is no event. A quaternion q enters as the products q_i q_j, in which a rotation is linear and q and -q are
-    the same. A position does not enter at all: a robot moves alike wherever it stands.
+    the same. A pose on the floor does not enter at all, and its change is seen from the robot, along its own heading: a
+    robot moves alike wherever it stands and looks.
 
     Attributes:
         obs_dim: Number of observation dimensions.
         angle_dims: Those that are angles in rad.
         quaternion_dims: The four of a unit quaternion, or none.
-        position_dims: Those on which the dynamics does not depend.
+        pose_dims: x, y and heading of a robot on a floor, the heading as an angle in rad or as its sine and its cosine;
+            three dimensions, four, or none.
+
+    Raises:
+        ValueError: The dimensions are of another number, name one twice, or do not exist.
     """
 
     obs_dim: int
     angle_dims: tuple[int, ...] = ()
     quaternion_dims: tuple[int, ...] = ()
-    position_dims: tuple[int, ...] = ()
+    pose_dims: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, sizes in (("quaternion_dims", (0, 4)), ("pose_dims", (0, 3, 4))):
+            if len(getattr(self, name)) not in sizes:
+                wanted = " or ".join(str(size) for size in sizes[1:])
+                raise ValueError(f"{name} must name {wanted} dimensions or none, got {getattr(self, name)}.")
+        dims = [*self.angle_dims, *self.quaternion_dims, *self.pose_dims]
+        if len(set(dims)) < len(dims):
+            raise ValueError(f"{', '.join(DIMS)} name a dimension twice: {dims}.")
+        if any(not 0 <= dim < self.obs_dim for dim in dims):
+            raise ValueError(
+                f"{', '.join(DIMS)} name dimensions that an observation of {self.obs_dim} has not: {dims}."
+            )
 
     @property
     def other_dims(self) -> list[int]:
         """Dimensions that enter as they are."""
-        special = {*self.angle_dims, *self.quaternion_dims, *self.position_dims}
+        special = {*self.angle_dims, *self.quaternion_dims, *self.pose_dims}
         return [dim for dim in range(self.obs_dim) if dim not in special]
 
     @property
@@ -67,16 +85,50 @@ class ObservationLayout:
         return torch.cat(parts, dim=-1)
 
     def change(self, obs: Tensor, next_obs: Tensor) -> Tensor:
-        """What a model predicts: next_obs - obs, (..., obs_dim), angles and quaternions the short way round."""
+        """What a model predicts, (..., obs_dim): how each number changes, all angles the short way round."""
         change = next_obs - obs
-        if self.angle_dims:
-            angle = change[..., self.angle_dims]
-            change[..., self.angle_dims] = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+        angles = [*self.angle_dims, *self.pose_dims[2:]] if len(self.pose_dims) == 3 else list(self.angle_dims)
+        if angles:
+            change[..., angles] = torch.remainder(change[..., angles] + math.pi, 2 * math.pi) - math.pi
         if self.quaternion_dims:
             q, q_next = obs[..., self.quaternion_dims], next_obs[..., self.quaternion_dims]
             nearer = torch.where((q * q_next).sum(dim=-1, keepdim=True) < 0.0, -q_next, q_next)
             change[..., self.quaternion_dims] = nearer - q
+        if self.pose_dims:
+            (x, y), (sine, cosine) = self.pose_dims[:2], self._heading(obs)
+            dx, dy = change[..., x], change[..., y]
+            change[..., x], change[..., y] = cosine * dx + sine * dy, cosine * dy - sine * dx
+            if len(self.pose_dims) == 4:
+                s, c = self.pose_dims[2:]
+                next_sine, next_cosine = self._heading(next_obs)
+                change[..., s] = next_sine * cosine - next_cosine * sine
+                change[..., c] = next_cosine * cosine + next_sine * sine - 1.0
         return change
+
+    def advance(self, obs: Tensor, change: Tensor) -> Tensor:
+        """The next observations from a :meth:`change`; angles are not wrapped. ``change`` is used up."""
+        if not self.pose_dims:
+            return change.add_(obs) if not change.requires_grad else change + obs
+        (x, y), (sine, cosine) = self.pose_dims[:2], self._heading(obs)
+        ahead, aside = change[..., x], change[..., y]
+        next_obs = obs + change
+        next_obs[..., x] = obs[..., x] + cosine * ahead - sine * aside
+        next_obs[..., y] = obs[..., y] + sine * ahead + cosine * aside
+        if len(self.pose_dims) == 4:
+            s, c = self.pose_dims[2:]
+            turned_sine, turned_cosine = change[..., s], change[..., c] + 1.0
+            turned = torch.stack(
+                [sine * turned_cosine + cosine * turned_sine, cosine * turned_cosine - sine * turned_sine], dim=-1
+            )
+            next_obs[..., [s, c]] = turned / turned.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+        return next_obs
+
+    def _heading(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Sine and cosine of the robot's heading, (...)."""
+        if len(self.pose_dims) == 4:
+            return obs[..., self.pose_dims[2]], obs[..., self.pose_dims[3]]
+        heading = obs[..., self.pose_dims[2]]
+        return heading.sin(), heading.cos()
 
     def inputs(self, obs: Tensor) -> Tensor:
         """As :meth:`features` with less copying, for :meth:`weights_for_inputs`.

@@ -16,7 +16,7 @@ class LearnedReward(nn.Module):
     """r(s, a, s') as a network of its own, since a situation changes the dynamics and never the task.
 
     Args:
-        layout: Of the observations. Positions count here: a goal has a place.
+        layout: Of the observations. A pose counts here: a goal has a place.
         action_dim: Number of action dimensions.
         width: Width of the two hidden layers.
     """
@@ -28,7 +28,7 @@ class LearnedReward(nn.Module):
 
     def __init__(self, layout: ObservationLayout, action_dim: int, width: int = 128) -> None:
         super().__init__()
-        self._layout = replace(layout, position_dims=())
+        self._layout = replace(layout, pose_dims=())
         inputs = 2 * self._layout.n_features + action_dim
         self.layers = nn.Sequential(
             nn.Linear(inputs, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 1)

@@ -37,7 +37,7 @@ from famle_agent.envs import (
 )
 from famle_agent.errors import NotLearnedError
 from famle_agent.hyperparameters import Hyperparameters, robot_of
-from famle_agent.observation import DIMS
+from famle_agent.observation import DIMS, ObservationLayout
 from famle_agent.planning import RewardFn
 from famle_agent.policies import MakePolicy, make_held_uniform, make_planning
 from famle_agent.reward import LearnedReward
@@ -67,8 +67,9 @@ class SimulationLearner(BaseAlgorithm):
         angle_dims: Observation dimensions that are angles in rad. None takes the environment's ``angle_dims``.
         quaternion_dims: The four observation dimensions of a unit quaternion, or none of them. None takes the
             environment's ``quaternion_dims``.
-        position_dims: Observation dimensions on which the dynamics does not depend, as where on the floor a robot is.
-            None takes the environment's ``position_dims``.
+        pose_dims: x, y and heading of a robot on a floor, the heading as an angle or as its sine and its cosine: with
+            them, the model knows that a robot moves alike wherever it stands and looks. None takes the environment's
+            ``pose_dims``, but in ``"paper"`` mode, whose model knows nothing of the kind.
         tensorboard_log: Folder for TensorBoard; None logs nothing there.
         verbose: 0 for silence, 1 for information, 2 for debugging.
         device: ``"auto"``, ``"cpu"`` or ``"cuda"``.
@@ -99,7 +100,7 @@ class SimulationLearner(BaseAlgorithm):
         reward_fn: RewardFn | None = None,
         angle_dims: Sequence[int] | None = None,
         quaternion_dims: Sequence[int] | None = None,
-        position_dims: Sequence[int] | None = None,
+        pose_dims: Sequence[int] | None = None,
         tensorboard_log: str | None = None,
         verbose: int = 0,
         device: torch.device | str = "auto",
@@ -130,7 +131,7 @@ class SimulationLearner(BaseAlgorithm):
         self.hyperparameters = robot.hyperparameters(mode, **overrides)
         self._reward_fn = reward_fn
         self._learned_reward: LearnedReward | None = None
-        self._dims = self._dims_of(angle_dims, quaternion_dims, position_dims)
+        self._dims = self._dims_of(angle_dims, quaternion_dims, pose_dims)
         self._generator = torch.Generator(self.device)
         self._setup_model()
         if pretrained and robot.pretrained is not None:
@@ -169,17 +170,15 @@ class SimulationLearner(BaseAlgorithm):
 
     def _dims_of(self, *given: Sequence[int] | None) -> dict[str, tuple[int, ...]]:
         """The special dimensions of an observation by name: those that were given, else the environment's."""
-        dims = {}
-        for name, chosen in zip(DIMS, given, strict=True):
-            known = () if self.env is None else env_attribute(self.env, name, ())
-            dims[name] = tuple(known if chosen is None else chosen)
-        if len(dims["quaternion_dims"]) not in (0, 4):
-            raise ValueError(f"quaternion_dims must name four dimensions or none, got {dims['quaternion_dims']}.")
-        flat = [dim for some in dims.values() for dim in some]
-        if len(set(flat)) < len(flat):
-            raise ValueError(f"{', '.join(DIMS)} name a dimension twice: {dims}.")
-        if self.env is not None and any(not 0 <= dim < self.observation_space.shape[0] for dim in flat):
-            raise ValueError(f"{dims} name dimensions that {self.observation_space} has not.")
+        names = dict(zip(DIMS, given, strict=True))
+        known = {name: () if self.env is None else tuple(env_attribute(self.env, name, ())) for name in DIMS}
+        if self.mode == "paper":
+            # The paper's model knows nothing of poses; a heading that is an angle is still one.
+            x_y_heading = known.pop("pose_dims")
+            known |= {"pose_dims": (), "angle_dims": known["angle_dims"] + x_y_heading[2:] * (len(x_y_heading) == 3)}
+        dims = {name: known[name] if chosen is None else tuple(chosen) for name, chosen in names.items()}
+        if self.env is not None:
+            ObservationLayout(self.observation_space.shape[0], **dims)  # refuses what cannot be
         return dims
 
     @abstractmethod

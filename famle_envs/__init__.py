@@ -1,6 +1,6 @@
 """Simulated robots that can break: Gymnasium environments with a ``situation``.
 
-Importing the package registers ``FamleReacher-v0`` and ``FamleAnt-v0``.
+Importing the package registers ``FamleReacher-v0``, ``FamleAnt-v0``, ``FamleQuadruped-v0`` and ``FamleMinitaur-v0``.
 """
 
 import gymnasium as gym

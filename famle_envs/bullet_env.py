@@ -20,11 +20,11 @@ from famle_envs.situation import Situation, resolve_situation
 if TYPE_CHECKING:
     from importlib.resources.abc import Traversable
 
-__all__ = ["Array", "BulletEnv"]
+__all__ = ["HOLDING_FORCE", "Array", "BulletEnv"]
 
 Array = npt.NDArray[np.floating[Any]]
 
-_HOLDING_FORCE = 1e4  # of a locked joint, far above what any motor here can exert (N m)
+HOLDING_FORCE = 1e4  # of a locked joint, far above what any motor here can exert (N m)
 _FAULTY_COLOUR = (0.85, 0.25, 0.2, 1.0)
 
 
@@ -66,6 +66,8 @@ class BulletEnv(gym.Env[Array, Array]):
     """Observation dimensions that are angles in [-pi, pi], where pi and -pi are the same place."""
     quaternion_dims: ClassVar[tuple[int, ...]] = ()
     """The four observation dimensions of a unit quaternion, where q and -q are the same orientation."""
+    pose_dims: ClassVar[tuple[int, ...]] = ()
+    """x, y and heading of a robot on a floor; the heading as an angle, or as its sine and its cosine."""
     training_situations: ClassVar[tuple[Situation, ...]]
     """The situations of the paper's meta-training."""
     presets: ClassVar[Mapping[str, Situation]]
@@ -241,9 +243,10 @@ class BulletEnv(gym.Env[Array, Array]):
         with as_file(self.asset_folder / self.asset) as path:
             self._robot = self._load_robot(str(path), client)
         self.joint_limits = self._read_joint_limits()
-        self._colours = {
-            shape[1]: shape[7] for shape in pybullet.getVisualShapeData(self._robot, physicsClientId=client)
-        }
+        shapes = pybullet.getVisualShapeData(self._robot, physicsClientId=client)
+        links = [shape[1] for shape in shapes]
+        # (link, index among the link's shapes): colour
+        self._colours = {(link, links[:i].count(link)): shapes[i][7] for i, link in enumerate(links)}
         self._start = pybullet.saveState(physicsClientId=client)
 
     @abstractmethod
@@ -271,16 +274,16 @@ class BulletEnv(gym.Env[Array, Array]):
                 list(self._locked_at),
                 pybullet.POSITION_CONTROL,
                 targetPositions=list(self._locked_at.values()),
-                forces=[_HOLDING_FORCE] * len(self._locked_at),
+                forces=[HOLDING_FORCE] * len(self._locked_at),
                 physicsClientId=self._world,
             )
 
     def _colour_faulty_joints(self) -> None:
         faulty = {self.joints[joint] for joint, gain in enumerate(self._situation.motor_gain) if gain != 1.0}
         faulty |= set(self._locked_at)
-        for link, colour in self._colours.items():
+        for (link, shape), colour in self._colours.items():
             rgba = _FAULTY_COLOUR if link in faulty else colour
-            pybullet.changeVisualShape(self._robot, link, rgbaColor=rgba, physicsClientId=self._world)
+            pybullet.changeVisualShape(self._robot, link, shape, rgbaColor=rgba, physicsClientId=self._world)
 
     def _info(self) -> dict[str, Any]:
         # A string: Gymnasium wants nothing in `info` to be shared between two steps.

@@ -11,14 +11,13 @@ import numpy as np
 import pybullet
 from gymnasium import spaces
 
-from famle_envs.bullet_env import Array, BulletEnv
+from famle_envs.bullet_env import HOLDING_FORCE, Array, BulletEnv
 from famle_envs.gaits import GAIT_DIM, trot
 from famle_envs.reality import SIMULATOR, Profile, resolve_profile
 from famle_envs.situation import Situation
 
 __all__ = ["GaitEnv"]
 
-_HOLDING_FORCE = 1e4  # of a blocked joint, far above what any servo here can exert (N m)
 _SETTLING_STEPS = 50  # until a robot that was put on the floor stands still
 
 
@@ -26,14 +25,14 @@ class GaitEnv(BulletEnv):
     """Base of the robots that walk one gait a second. Between two actions the robot walks on; nothing is reset.
 
     Args:
-        profile: What the body is beside its situation: ``"simulator"``, ``"reality"`` or a :class:`Profile`. Agents
-            are trained on the simulator only.
+        profile: What the body is beside its situation: ``"simulator"``, ``"reality"``, a :class:`Profile` or a mapping
+            of its fields. Agents are trained on the simulator only.
         situation: See :class:`BulletEnv`.
         render_mode: See :class:`BulletEnv`.
 
     Raises:
         TypeError: The profile is of another type; and as :class:`BulletEnv`.
-        ValueError: The profile is unknown; and as :class:`BulletEnv`.
+        ValueError: The profile is unknown or not one of this robot; and as :class:`BulletEnv`.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012 (Gymnasium's own type)
@@ -59,12 +58,15 @@ class GaitEnv(BulletEnv):
     def __init__(
         self,
         *,
-        profile: Profile | str = SIMULATOR,
+        profile: Profile | Mapping[str, Any] | str = SIMULATOR,
         situation: Situation | Mapping[str, Any] | str | None = None,
         render_mode: str | None = None,
     ) -> None:
-        self.profile = resolve_profile(profile, self.profiles)
+        self.profile = resolve_profile(profile, self.profiles, len(self.joints))
         self.action_space = spaces.Box(-1.0, 1.0, (GAIT_DIM,))
+        self._gains = [self.position_gain] * len(self.joints)
+        seconds = self.time_step / self.substeps / self.position_gain  # in which a servo would make good an error
+        self._reach = seconds * self.profile.motor_speed * self.motor_speed
         self._zero_errors = np.array(self.profile.zero_errors or (0.0,) * len(self.joints))
         self._times = self.time_step * np.arange(self.physics_steps)
         super().__init__(situation=situation, render_mode=render_mode)
@@ -90,18 +92,24 @@ class GaitEnv(BulletEnv):
         targets = self._with_backlash(self._delayed(targets))
         targets += self._zero_errors
         targets[:, self._blocked] = self.rest_angles[self._blocked]
-        gains = [self.position_gain] * len(self.joints)
-        for row in targets.tolist():
-            pybullet.setJointMotorControlArray(
-                self._robot,
-                self.joints,
-                pybullet.POSITION_CONTROL,
-                targetPositions=row,
-                forces=self._forces,
-                positionGains=gains,
-                physicsClientId=self._client,
-            )
+        for row in targets:
+            self._actuate(row)
             pybullet.stepSimulation(physicsClientId=self._client)
+
+    def _actuate(self, action: Array) -> None:
+        """Sends the servos to joint angles, (n_joints,); no servo sees an error beyond its speed."""
+        states = pybullet.getJointStates(self._robot, self.joints, physicsClientId=self._client)
+        angles = np.array([state[0] for state in states])
+        targets = angles + np.minimum(np.maximum(action - angles, -self._reach), self._reach)
+        pybullet.setJointMotorControlArray(
+            self._robot,
+            self.joints,
+            pybullet.POSITION_CONTROL,
+            targetPositions=targets.tolist(),
+            forces=self._forces,
+            positionGains=self._gains,
+            physicsClientId=self._client,
+        )
 
     def _delayed(self, targets: Array) -> Array:
         """The targets that arrive in this control step, (n, n_joints), the last ones of the step before first."""
@@ -136,13 +144,14 @@ class GaitEnv(BulletEnv):
         robot = self._place_robot(path, client)
         links = range(-1, pybullet.getNumJoints(robot, physicsClientId=client))
         self._as_built = {link: pybullet.getDynamicsInfo(robot, link, physicsClientId=client) for link in links}
-        self._forces = [self.motor_torque] * len(self.joints)
+        info = [pybullet.getJointInfo(robot, joint, physicsClientId=client) for joint in self.joints]
+        self._damping_as_built = [row[6] for row in info]
         pybullet.setJointMotorControlArray(
             robot,
             self.joints,
             pybullet.POSITION_CONTROL,
             targetPositions=self.rest_angles.tolist(),
-            forces=self._forces,
+            forces=[self.motor_torque] * len(self.joints),
             physicsClientId=client,
         )
         for _ in range(_SETTLING_STEPS):
@@ -159,14 +168,13 @@ class GaitEnv(BulletEnv):
         self._blocked = list(situation.locked_joints)
         self._forces = [profile.motor_strength * self.motor_torque] * len(self.joints)
         for joint in self._blocked:
-            self._forces[joint] = _HOLDING_FORCE
+            self._forces[joint] = HOLDING_FORCE
         for link, built in self._as_built.items():
             factor = profile.base_mass * situation.base_mass if link == -1 else profile.leg_mass
             self._change(self._robot, link, mass=factor * built[0])
             self._change(self._robot, link, localInertiaDiagonal=[factor * value for value in built[2]])
-        for joint in self.joints:
-            self._change(self._robot, joint, maxJointVelocity=profile.motor_speed * self.motor_speed)
-            self._change(self._robot, joint, jointDamping=profile.joint_damping)
+        for joint, built in zip(self.joints, self._damping_as_built, strict=True):
+            self._change(self._robot, joint, jointDamping=built + profile.joint_damping)
         friction = self.floor_friction * profile.floor_friction * situation.friction
         self._change(self._floor, -1, lateralFriction=friction)
         if profile.contact_stiffness:
@@ -175,9 +183,6 @@ class GaitEnv(BulletEnv):
 
     def _change(self, body: int, link: int, **dynamics: Any) -> None:
         pybullet.changeDynamics(body, link, physicsClientId=self._world, **dynamics)
-
-    def _actuate(self, action: Array) -> None:
-        raise NotImplementedError("A gait is many commands; see _simulate.")
 
     def _camera(self) -> dict[str, Any]:
         x, y, _ = self.position

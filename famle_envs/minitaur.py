@@ -104,15 +104,15 @@ class MinitaurEnv(GaitEnv):
     position_gain = 0.05
     rest_angles = _REST * np.repeat(_LEG_SIDE, 2)
     profiles: ClassVar[Mapping[str, Profile]] = {REALITY.name: REALITY}
-    position_dims = (0, 1)
-    angle_dims = (3, 4, 5)
+    angle_dims = (3, 4)
+    pose_dims = (0, 1, 5)
     training_situations = _TRAINING
     presets: ClassVar[Mapping[str, Situation]] = {situation.label: situation for situation in _TRAINING}
 
     def __init__(
         self,
         *,
-        profile: Profile | str = SIMULATOR,
+        profile: Profile | Mapping[str, Any] | str = SIMULATOR,
         situation: Situation | Mapping[str, Any] | str | None = None,
         render_mode: str | None = None,
     ) -> None:

@@ -109,7 +109,7 @@ class QuadrupedEnv(GaitEnv):
     motor_speed = 7.0
     rest_angles = np.zeros(_N_JOINTS)
     profiles: ClassVar[Mapping[str, Profile]] = {REALITY.name: REALITY}
-    position_dims = (0, 1)
+    pose_dims = (0, 1, 2, 3)
     training_situations = _TRAINING
     presets: ClassVar[Mapping[str, Situation]] = {
         situation.name: situation for situation in (*_TRAINING, *(blocked_leg(leg) for leg in range(len(LEGS))))
@@ -120,7 +120,7 @@ class QuadrupedEnv(GaitEnv):
         *,
         goal: tuple[float, float] = (2.5, 0.0),
         success_radius: float = 0.25,
-        profile: Profile | str = SIMULATOR,
+        profile: Profile | Mapping[str, Any] | str = SIMULATOR,
         situation: Situation | Mapping[str, Any] | str | None = None,
         render_mode: str | None = None,
     ) -> None:
@@ -142,6 +142,19 @@ class QuadrupedEnv(GaitEnv):
             Rewards in m, (...), in the type of ``next_obs``.
         """
         return self._distance(obs) - self._distance(next_obs)
+
+    def planning_reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
+        """What a planner should look for: -|p' - goal|, in m.
+
+        A sum of progress is the same for each way to the goal within the horizon; a sum of distances is best for the
+        shortest.
+
+        Args:
+            obs: Observations, (..., 4). Not used.
+            action: Actions, (..., 4). Not used.
+            next_obs: Observations one gait later, (..., 4); a NumPy array or a torch tensor.
+        """
+        return -self._distance(next_obs)
 
     def _distance(self, obs: Any) -> Any:
         dx, dy = obs[..., 0] - self.goal[0], obs[..., 1] - self.goal[1]

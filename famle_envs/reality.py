@@ -5,9 +5,12 @@ A profile is fixed before any result of an agent on it is looked at, and no agen
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
+
+from famle_envs.arguments import number_within
 
 __all__ = ["SIMULATOR", "Profile", "resolve_profile"]
 
@@ -48,10 +51,22 @@ class Profile:
     position_noise: float = 0.0
     orientation_noise: float = 0.0
 
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self)[1:]:
+            value = getattr(self, field.name)
+            if field.name == "zero_errors":
+                object.__setattr__(
+                    self, field.name, tuple(number_within(field.name, x, -10.0, 10.0, "rad") for x in value)
+                )
+            elif field.name in _FACTORS:
+                number_within(field.name, value, 1e-3, 1e3, "times that of the simulator")
+            else:
+                number_within(field.name, value, 0.0, 1e6, "(see the profile's fields for units)")
+
     @property
     def is_simulator(self) -> bool:
         """Whether agents may be trained on it."""
-        return self.name == SIMULATOR.name
+        return self == SIMULATOR
 
     def __str__(self) -> str:
         fields = {key: value for key, value in vars(self).items() if key != "name"}
@@ -59,21 +74,31 @@ class Profile:
         return ": ".join([self.name, ", ".join(differs)]) if differs else self.name
 
 
+_FACTORS = {"motor_strength", "motor_speed", "base_mass", "leg_mass", "floor_friction"}
 SIMULATOR = Profile()
 
 
-def resolve_profile(profile: Profile | str, known: Mapping[str, Profile]) -> Profile:
+def resolve_profile(profile: Profile | Mapping[str, Any] | str, known: Mapping[str, Profile], n_joints: int) -> Profile:
     """A profile, be it given or named.
 
+    Args:
+        profile: A profile, a mapping of its fields or a name.
+        known: The robot's profiles by name, beside the simulator.
+        n_joints: The number of its joints.
+
     Raises:
-        TypeError: It is neither a profile nor a name.
-        ValueError: A robot has no profile of that name.
+        TypeError: It is neither a profile nor a mapping nor a name, or a field is unknown.
+        ValueError: The robot has no profile of that name, or another number of joints.
     """
-    if isinstance(profile, Profile):
-        return profile
-    if not isinstance(profile, str):
-        raise TypeError(f"profile must be a Profile or a name, got {type(profile).__name__}.")
-    profiles: dict[str, Any] = {SIMULATOR.name: SIMULATOR, **known}
-    if profile not in profiles:
-        raise ValueError(f"There is no profile {profile!r}. Profiles: {', '.join(profiles)}.")
-    return profiles[profile]  # type: ignore[no-any-return]
+    if isinstance(profile, Mapping):
+        profile = Profile(**profile)
+    if isinstance(profile, str):
+        profiles = {SIMULATOR.name: SIMULATOR, **known}
+        if profile not in profiles:
+            raise ValueError(f"There is no profile {profile!r}. Profiles: {', '.join(profiles)}.")
+        profile = profiles[profile]
+    if not isinstance(profile, Profile):
+        raise TypeError(f"profile must be a Profile, a mapping of its fields or a name, got {type(profile).__name__}.")
+    if len(profile.zero_errors) not in (0, n_joints):
+        raise ValueError(f"zero_errors must name each of the {n_joints} joints or none, got {profile.zero_errors}.")
+    return profile

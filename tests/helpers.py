@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
+from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
+import pybullet
 import torch
 from hypothesis import strategies as st
 from torch import Tensor
@@ -16,6 +19,8 @@ from famle_agent import FAMLE, OnlineState, Transitions
 from famle_agent.adaptation import Belief, Candidates, Memory, adapt, prior, window_posterior
 from famle_agent.dynamics import Dynamics, Theta
 from famle_agent.inner_loop import InnerLoop
+from famle_agent.observation import DIMS, ObservationLayout
+from famle_envs.gait_env import GaitEnv
 
 Array = npt.NDArray[Any]
 
@@ -38,16 +43,75 @@ def run(agent: FAMLE, env: gym.Env[Any, Any], steps: int, seed: int = 0) -> Onli
     return state
 
 
+# --- robots that walk a gait a second -----------------------------------------------------------------------
+
+
+def walk(env: GaitEnv, action: Any, gaits: int = 1) -> Array:
+    """The observations after each of some equal gaits, (gaits, obs_dim)."""
+    return np.stack([env.step(np.asarray(action, np.float64))[0] for _ in range(gaits)])
+
+
+def watch(env: GaitEnv, action: Any, read: Callable[[GaitEnv], Any]) -> Array:
+    """What ``read`` sees of the robot after each call of the simulator in one gait."""
+    rows, simulate = [], pybullet.stepSimulation
+
+    def simulate_and_read(**kwargs: Any) -> None:
+        simulate(**kwargs)
+        rows.append(read(env))
+
+    with patch.object(pybullet, "stepSimulation", simulate_and_read):
+        env.step(np.asarray(action, np.float64))
+    return np.array(rows)
+
+
+def joint_angles(env: GaitEnv) -> list[float]:
+    return [state[0] for state in pybullet.getJointStates(env._robot, env.joints, physicsClientId=env._client)]
+
+
+def joint_speeds(env: GaitEnv) -> list[float]:
+    return [state[1] for state in pybullet.getJointStates(env._robot, env.joints, physicsClientId=env._client)]
+
+
+def masses(env: GaitEnv) -> Array:
+    """Of the base and of each link, in kg."""
+    return np.array([info[0] for info in _dynamics(env)])
+
+
+def inertias(env: GaitEnv) -> Array:
+    """Of the base and of each link about its axes, (n, 3), in kg m^2."""
+    return np.array([info[2] for info in _dynamics(env)])
+
+
+def _dynamics(env: GaitEnv) -> list[tuple[Any, ...]]:
+    links = range(-1, pybullet.getNumJoints(env._robot, physicsClientId=env._client))
+    return [pybullet.getDynamicsInfo(env._robot, link, physicsClientId=env._client) for link in links]
+
+
+def put(env: GaitEnv, place: tuple[float, float, float], quaternion: Any = (0.0, 0.0, 0.0, 1.0)) -> None:
+    """Moves the robot as a whole; x, y, z, w of the quaternion."""
+    pybullet.resetBasePositionAndOrientation(env._robot, place, quaternion, physicsClientId=env._client)
+
+
 # --- models -------------------------------------------------------------------------------------------------
+
+
+@st.composite
+def layouts(draw: st.DrawFn, max_obs_dim: int = 12) -> ObservationLayout:
+    """Observations with special dimensions of all kinds, in any order."""
+    obs_dim = draw(st.integers(1, max_obs_dim))
+    free = list(draw(st.permutations(range(obs_dim))))
+    dims: dict[str, tuple[int, ...]] = {}
+    for name, sizes in (("quaternion_dims", (0, 4)), ("pose_dims", (0, 3, 4)), ("angle_dims", (0, 1, 2, 3))):
+        size = draw(st.sampled_from([size for size in sizes if size <= len(free)]))
+        dims[name], free = tuple(free[:size]), free[size:]
+    return ObservationLayout(obs_dim, **dims)
 
 
 @st.composite
 def models(draw: st.DrawFn) -> Dynamics:
     """Models of many shapes, with a normalisation that is not the identity."""
-    obs_dim, action_dim, members = draw(st.integers(1, 6)), draw(st.integers(1, 3)), draw(st.integers(1, 3))
-    dims = draw(st.permutations(range(obs_dim)))
-    quaternion_dims = dims[:4] if obs_dim >= 4 and draw(st.booleans()) else []
-    others = dims[len(quaternion_dims) :]
+    layout, action_dim, members = draw(layouts(8)), draw(st.integers(1, 3)), draw(st.integers(1, 3))
+    obs_dim = layout.obs_dim
     torch.manual_seed(draw(st.integers(0, 1000)))
     model = Dynamics(
         obs_dim,
@@ -55,8 +119,7 @@ def models(draw: st.DrawFn) -> Dynamics:
         n_situations=draw(st.integers(1, 5)),
         embedding_dim=draw(st.integers(1, 4)),
         hidden=draw(st.lists(st.integers(1, 9), min_size=1, max_size=3)),
-        angle_dims=others[: draw(st.integers(0, len(others)))],
-        quaternion_dims=quaternion_dims,
+        **{name: getattr(layout, name) for name in DIMS},
         gate_actions=draw(st.booleans()),
         interaction_rank=draw(st.integers(0, 3)),
         members=members,

@@ -149,7 +149,7 @@ def test_quaternions_are_those_of_the_environment_or_of_the_user(make_env: MakeE
 @pytest.mark.parametrize(
     ("dims", "message"),
     [
-        ({"quaternion_dims": (1, 2, 3)}, "four dimensions or none"),
+        ({"quaternion_dims": (1, 2, 3)}, "4 dimensions or none"),
         ({"quaternion_dims": (1, 2, 3, 3), "angle_dims": ()}, "twice"),
         ({"quaternion_dims": (1, 2, 3, 4), "angle_dims": (4,)}, "twice"),
         ({"angle_dims": (5, 5)}, "twice"),
