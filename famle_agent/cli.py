@@ -15,6 +15,7 @@ from rich.console import Console
 from famle_agent.demo import run_demo, run_episode
 from famle_agent.errors import NotLearnedError
 from famle_agent.famle import FAMLE
+from famle_agent.journey import run_journey_demo
 from famle_agent.walking import run_walking_demo
 from famle_agent.wrapper import FAMLEWrapper
 
@@ -23,9 +24,9 @@ __all__ = ["main"]
 
 @dataclass(frozen=True)
 class Demo:
-    """Break a robot and watch it adapt: the arm, meta-learned from scratch, between episodes; the ant in mid-run."""
+    """Break a robot and watch it adapt: arm and ant in simulation, quadruped and Minitaur in their reality."""
 
-    robot: Literal["reacher", "ant"] = "reacher"
+    robot: Literal["reacher", "ant", "quadruped", "minitaur"] = "reacher"
     """The robot."""
     situation: str = ""
     """What breaks: a preset or a description such as "joint 0 reversed, joint 3 dead"; by default the robot's own."""
@@ -44,6 +45,8 @@ class Demo:
         overrides |= {"situation": self.situation} if self.situation else {}
         if self.robot == "ant":
             run_walking_demo(self.robot, out=self.out, seed=self.seed, **overrides)
+        elif self.robot in ("quadruped", "minitaur"):
+            run_journey_demo(self.robot, out=self.out, seed=self.seed, **overrides)
         else:
             run_demo(self.robot, episodes=self.episodes, out=self.out, seed=self.seed, **overrides)
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from PIL import Image, ImageDraw
 
-__all__ = ["Frames", "plot_returns", "plot_speed", "running_mean", "side_by_side", "style"]
+__all__ = ["Frames", "plot_paths", "plot_returns", "plot_speed", "running_mean", "side_by_side", "style"]
 
 Frames = Sequence[npt.NDArray[np.uint8]]
 
@@ -82,6 +82,32 @@ def plot_speed(
     )
     axes.axhline(0.0, color="0.8", linewidth=1)
     style(axes, "time (s)", "forward speed (m/s)", title)
+    axes.legend()
+    figure.savefig(path, dpi=150)
+
+
+def plot_paths(
+    paths: Mapping[str, npt.NDArray[Any]],
+    title: str,
+    path: str | os.PathLike[str],
+    goal: tuple[float, float] | None = None,
+) -> None:
+    """Draws the ways of robots from above, a dot for each action.
+
+    Args:
+        paths: x and y in m, (n, 2), by the name of the agent.
+        title: Of the picture.
+        path: Where the PNG goes.
+        goal: Where they should get to.
+    """
+    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
+    axes = figure.add_subplot()
+    for name, way in paths.items():
+        axes.plot(way[:, 0], way[:, 1], marker=".", label=name)
+    if goal is not None:
+        axes.plot(*goal, marker="*", markersize=14, color="0.3", linestyle="none", label="goal")
+    axes.set_aspect("equal", adjustable="datalim")
+    style(axes, "x (m)", "y (m)", title)
     axes.legend()
     figure.savefig(path, dpi=150)
 

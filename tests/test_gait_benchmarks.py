@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks import minitaur, quadruped
+from benchmarks.gait_robots import METHODS, Task, run
+from benchmarks.harness import Replicate, load_results, run_replicates
+from famle_envs import Situation
+from famle_envs.quadruped import QuadrupedEnv
+
+
+def test_tests_are_run_in_reality_and_on_damage_that_no_training_situation_has() -> None:
+    for experiment in ("yaw", "leg", "both", "later"):
+        for seed in range(4):
+            task = quadruped.task_of(experiment, seed, quadruped.Args())
+            assert task.profile == "reality"
+            test = task.later or task.situation
+            assert test not in QuadrupedEnv.training_situations
+            assert not test.is_intact
+    legs = {quadruped.task_of("leg", seed, quadruped.Args()).situation.locked_joints for seed in range(12)}
+    assert legs == {(0, 1, 2), (3, 4, 5), (6, 7, 8), (9, 10, 11)}
+    assert minitaur.task_of("reality", 0, minitaur.Args()).profile == "reality"
+    assert minitaur.task_of("home", 0, minitaur.Args()).profile == "simulator"
+
+
+@pytest.mark.slow
+def test_replicate_is_stored_with_its_profile_and_summed_up(tmp_path: Path) -> None:
+    for method in ("famle", "famle-frozen"):
+        task = quadruped.task_of("yaw", 0, quadruped.Args(cache=tmp_path))
+        run_replicates([Replicate(method, 0, partial(run, method, task))], tmp_path, jobs=1)
+    results = load_results(tmp_path)
+    for result in results:
+        assert result["profile"].startswith("reality: motor_strength 0.03")
+        assert len(result["path"]) == result["gaits"] + 1
+        assert result["distance"] == pytest.approx(result["path"][-1][0], abs=1e-3)
+        assert result["reached"] == (np.hypot(2.5 - result["path"][-1][0], result["path"][-1][1]) < 0.25)
+    assert results[1]["believed"] == "intact"
+    assert quadruped.summary(results, "yaw").row_count == 2
+    assert minitaur.summary(results, "reality").row_count == 2
+
+
+@pytest.mark.parametrize("robot", ["quadruped", "minitaur"])
+@pytest.mark.parametrize("method", ["famle", "famle-frozen", "famle-nearest", "famle-sums"])
+def test_methods_are_the_shipped_agent_with_something_changed(robot: str, method: str, tmp_path: Path) -> None:
+    agent: Any = METHODS[method](Task(robot, 3, Situation(), "reality", tmp_path))
+    settings = agent.hyperparameters
+    assert agent.dynamics is not None
+    assert (settings.adapt_every == 0) == (method == "famle-frozen")
+    assert (settings.adaptation().steps == 0) == (method in ("famle-nearest", "famle-sums"))
+    agent.get_env().close()
+
+
+def test_success_rate_and_gaits_are_those_of_the_runs() -> None:
+    runs = [
+        {"method": "a", "reached": r, "gaits": g, "ms_per_plan": 1.0} for r, g in ((True, 10), (True, 20), (False, 80))
+    ]
+    table = quadruped.summary(runs, "yaw")
+    cells = [next(iter(column.cells)) for column in table.columns]
+    assert cells[:5] == ["a", "3", "67%", "15.0 +- 5.0", "20"]
