@@ -214,6 +214,7 @@ def adapt(
     inner_loop: InnerLoop,
     belief: Belief,
     validation_size: int = 0,
+    spread: bool = False,
 ) -> Belief:
     """Lines 6 and 7 of Algorithm 2 for B robots at once.
 
@@ -225,12 +226,15 @@ def adapt(
         belief: Its posterior counts; theta* and h* are found anew.
         validation_size: The newest transitions, which no gradient step sees. Steps that do not make them more likely
             are taken back, in each member of the ensemble by itself; 0 trusts all steps, as the paper does.
+        spread: Whether the members of the ensemble begin with candidates of their own that cover the posterior
+            together, instead of all with the most likely one. A plan has to be good then in all that may be the case.
     """
     robots, members = len(memory.weight), model.members
 
     # h_likely = argmax log p(D_M | theta_meta, h) over the candidates (line 6).
     log_posterior = belief.log_posterior
-    h_likely = candidates.h[:, log_posterior.argmax(dim=1)].transpose(0, 1).flatten(0, 1)
+    likely = _quantiles(belief.posterior, members if spread else 1).expand(-1, members)
+    h_likely = candidates.h[torch.arange(members, device=likely.device), likely].flatten(0, 1)
 
     # theta*, h* = k steps from theta_meta, h_likely (line 7), each member of the ensemble by itself.
     theta_meta = expand(model.parameters_by_name(), robots)
@@ -247,6 +251,14 @@ def adapt(
         h = _choose(better, h, start.h)
     adapted = replace(start, theta=theta, h=h)
     return adapted.where(adapted.is_finite(), start)  # steps that diverged are no steps
+
+
+def _quantiles(posterior: Tensor, n: int) -> Tensor:
+    """Candidates (B, n) at the quantiles 0, 1 / n, ... of posteriors (B, C), sorted from the most likely one on."""
+    descending, order = posterior.sort(dim=1, descending=True, stable=True)
+    at = torch.arange(n, device=posterior.device) / n
+    index = torch.searchsorted(descending.cumsum(dim=1), at.expand(len(posterior), n).contiguous(), right=True)
+    return order.gather(1, index.clamp(max=posterior.shape[1] - 1))
 
 
 def _split(data: Batch, newest: int) -> tuple[Batch, Batch]:

@@ -103,4 +103,5 @@ class FAMLE(ModelBasedAgent):
             settings.adaptation(),
             belief,
             settings.validation_size,
+            settings.spread_members,
         )

@@ -67,6 +67,8 @@ class Hyperparameters:
         adapt_embedding_lr: beta of online adaptation; None takes ``embedding_lr``.
         validation_size: The newest transitions of the memory, which gradient steps do not see and which decide whether
             the steps are kept; 0 keeps all, as the paper does.
+        spread_members: Whether the members of the ensemble start from situations of their own, which together cover
+            what is likely, instead of all from the most likely one (the paper's).
         forget_at_reset: Whether a new episode empties the memory; damage outlasts an episode, so not by default.
         planner: ``"icem"``, ``"mppi"`` or ``"random_shooting"`` (the paper's).
         horizon: H, steps that the planner looks ahead.
@@ -114,6 +116,7 @@ class Hyperparameters:
     adapt_lr: float | None = None
     adapt_embedding_lr: float | None = None
     validation_size: int = 0
+    spread_members: bool = False
     forget_at_reset: bool = False
     planner: Literal["icem", "mppi", "random_shooting"] = "icem"
     horizon: int = 10
@@ -213,7 +216,7 @@ class Hyperparameters:
 
 _ONLINE = {
     *("compose", "likelihood_power", "hazard", "adapt_every", "memory_size", "forget_at_reset"),
-    *("adapt_steps", "adapt_lr", "adapt_embedding_lr", "validation_size"),
+    *("adapt_steps", "adapt_lr", "adapt_embedding_lr", "validation_size", "spread_members"),
     *("planner", "horizon", "candidates", "planner_iterations", "elites", "init_std", "noise_beta", "temperature"),
 }
 """Settings of the life on a robot; rounds in simulation plan too, but a model may be used with another planner."""

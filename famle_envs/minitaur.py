@@ -133,6 +133,17 @@ class MinitaurEnv(GaitEnv):
         """
         return next_obs[..., 0] - obs[..., 0]
 
+    def planning_reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
+        """What a planner should look for: the reward, less a metre for each rad of roll or pitch beyond 0.15.
+
+        Args:
+            obs: Observations, (..., 6); a NumPy array or a torch tensor.
+            action: Actions, (..., 4). Not used.
+            next_obs: Observations one gait later, (..., 6).
+        """
+        tilt = (abs(next_obs[..., 3:5]) - 0.15).clip(min=0.0).sum(-1)
+        return self.reward_fn(obs, action, next_obs) - tilt
+
     def _joint_targets(self, swing: Array, lift: Array) -> Array:
         length = _LEG_SIDE * (_REST - _FULL_LIFT * lift)
         forwards = -_FULL_SWING * swing
