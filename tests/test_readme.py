@@ -29,7 +29,17 @@ def test_files_that_the_readme_names_are_there() -> None:
         assert (ROOT / name).exists(), name
 
 
-@pytest.mark.parametrize("module", ["famle_agent.famle", "famle_envs.situation", "famle_envs.reacher"])
+@pytest.mark.parametrize(
+    "module",
+    [
+        "famle_agent.famle",
+        "famle_envs.situation",
+        "famle_envs.reacher",
+        "famle_envs.ant",
+        "famle_envs.quadruped",
+        "famle_envs.minitaur",
+    ],
+)
 def test_examples_in_the_docstrings_run(module: str) -> None:
     result = doctest.testmod(importlib.import_module(module))
     assert result.attempted > 0

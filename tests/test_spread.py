@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from famle_agent.adaptation import Candidates, Memory, _quantiles, adapt, prior
+from famle_agent.inner_loop import InnerLoop
+from tests.helpers import simple_model
+
+NO_STEPS = InnerLoop(0, 1e-3, 1e-2, "adam")
+
+
+def posteriors(weights: list[list[float]]) -> Tensor:
+    p = torch.tensor(weights)
+    return p / p.sum(dim=1, keepdim=True)
+
+
+@given(st.lists(st.lists(st.floats(0.01, 1.0), min_size=5, max_size=5), min_size=1, max_size=3), st.integers(1, 6))
+def test_quantiles_begin_with_the_most_likely_and_take_each_by_its_probability(
+    weights: list[list[float]], n: int
+) -> None:
+    p = posteriors(weights)
+    taken = _quantiles(p, n)
+    assert taken.shape == (len(p), n)
+    assert torch.equal(p.gather(1, taken[:, :1])[:, 0], p.amax(dim=1))
+    for row, choice in zip(p, taken, strict=True):
+        counts = torch.bincount(choice, minlength=5)
+        assert ((counts - n * row).abs() < 1.0 + 1e-4).all()
+
+
+def test_certain_posterior_leaves_one_candidate() -> None:
+    assert _quantiles(posteriors([[0.0, 0.0, 1.0], [1.0, 1e-9, 0.0]]), 4).tolist() == [[2] * 4, [0] * 4]
+
+
+def test_rows_do_not_depend_on_each_other() -> None:
+    p = posteriors([[0.4, 0.3, 0.3], [0.1, 0.1, 0.8]])
+    both, alone = _quantiles(p, 4), [_quantiles(row[None], 4) for row in p]
+    assert torch.equal(both, torch.cat(alone))
+
+
+@pytest.mark.parametrize("spread", [False, True])
+def test_members_start_from_situations_of_their_own_only_where_they_are_spread(spread: bool) -> None:
+    model = simple_model(n_situations=4, members=4)
+    candidates = Candidates.of(model, compose=False)
+    memory = Memory.empty(2, 5, model.obs_dim, model.action_dim, 4, torch.device("cpu"))
+    belief = prior(model, candidates, robots=2)
+    belief = belief.__class__(belief.theta, belief.h, posteriors([[1, 1, 1, 1], [0, 0, 9, 0]]).log())
+    h = adapt(model, candidates, memory, NO_STEPS, belief, spread=spread).h.view(2, 4, -1)
+    wanted = [0, 1, 2, 3] if spread else [0, 0, 0, 0]
+    for member, situation in enumerate(wanted):
+        torch.testing.assert_close(h[0, member], model.embeddings[member, situation])
+        torch.testing.assert_close(h[1, member], model.embeddings[member, 2])
