@@ -58,13 +58,13 @@ def shipped(task: Task, **overrides: Any) -> FAMLE:
 
 
 def oracle(task: Task) -> FAMLE:
-    """The upper line: its model is of 4,000 random gaits of the test robot itself, and it adapts all the same."""
+    """The upper line: its model is of 2,000 random gaits of the test robot itself, and it adapts all the same."""
     path = task.cache / f"{task.robot}-oracle-{task.profile}-{str(task.situation).replace(' ', '_')}.zip"
     if not path.exists():
         agent = FAMLE(task.robot, seed=0, device="cpu", pretrained=False, compose=False)
         # Collected by hand: no agent meta-learns on a profile, and this one is not to be had on a real robot.
         hold = make_held_uniform(agent.hyperparameters.action_hold)
-        agent.meta_learn(collect([task.make], [task.situation.label], 4000, hold, seed=0)).save(path)
+        agent.meta_learn(collect([task.make], [task.situation.label], 2000, hold, seed=0)).save(path)
     return FAMLE.load(path, device="cpu")
 
 

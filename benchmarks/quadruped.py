@@ -29,6 +29,7 @@ from famle_envs.quadruped import LEGS, REALITY, blocked_leg
 YAW = math.radians(30)
 PAPER = {"yaw": "32.6 +- 2.3", "leg": "43.1 +- 6.4", "both": "41.6 +- 7.7"}
 DEFAULT_METHODS = {
+    "later": ("famle", "famle-frozen", "famle-nearest"),
     "gap-home": ("one-simulator", "famle"),
     "gap-reality": ("one-simulator", "famle"),
 }
