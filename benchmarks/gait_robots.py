@@ -83,8 +83,9 @@ def one_simulator(task: Task) -> FAMLE:
 VARIANTS: Mapping[str, dict[str, Any]] = {
     "famle": {},
     "famle-frozen": {"adapt_every": 0},
-    "famle-nearest": {"adapt_steps": 0, "compose": False},
-    "famle-sums": {"adapt_steps": 0, "compose": True},
+    "famle-likeliest": {"spread_members": False},
+    "famle-nearest": {"adapt_steps": 0, "compose": False, "spread_members": False},
+    "famle-sums": {"adapt_steps": 0, "spread_members": False},
 }
 """The shipped agent with settings changed."""
 

@@ -16,7 +16,18 @@ from torch import Tensor
 from famle_agent.dynamics import Batch, Dynamics, Theta, expand
 from famle_agent.inner_loop import InnerLoop
 
-__all__ = ["Belief", "Candidates", "Memory", "adapt", "filtered_posterior", "prior", "window_posterior"]
+__all__ = [
+    "Belief",
+    "Candidates",
+    "Memory",
+    "adapt",
+    "filtered_posterior",
+    "prior",
+    "systematic_sample",
+    "window_posterior",
+]
+
+_GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)  # multiples of it, less their whole part, fill [0, 1) evenly
 
 
 @dataclass(frozen=True)
@@ -206,6 +217,22 @@ def filtered_posterior(candidates: Candidates, log_posterior: Tensor, log_p: Ten
     return (torch.logaddexp(stays, candidates.log_prior + math.log(hazard)) + log_p).log_softmax(dim=1)
 
 
+def systematic_sample(posterior: Tensor, n: int, offset: float) -> Tensor:
+    """N candidates for each robot, (B, n), each about n times its probability often.
+
+    Systematic resampling, as in a particle filter: the candidates at the quantiles (i + offset) / n.
+
+    Args:
+        posterior: (B, C).
+        n: Size of the sample.
+        offset: In [0, 1).
+    """
+    descending, order = posterior.sort(dim=1, descending=True, stable=True)
+    at = (torch.arange(n, device=posterior.device) + offset) / n
+    index = torch.searchsorted(descending.cumsum(dim=1), at.expand(len(posterior), n).contiguous(), right=True)
+    return order.gather(1, index.clamp(max=posterior.shape[1] - 1))
+
+
 @torch.no_grad()
 def adapt(
     model: Dynamics,
@@ -226,14 +253,17 @@ def adapt(
         belief: Its posterior counts; theta* and h* are found anew.
         validation_size: The newest transitions, which no gradient step sees. Steps that do not make them more likely
             are taken back, in each member of the ensemble by itself; 0 trusts all steps, as the paper does.
-        spread: Whether the members of the ensemble begin with candidates of their own that cover the posterior
-            together, instead of all with the most likely one. A plan has to be good then in all that may be the case.
+        spread: Whether the members of the ensemble begin with candidates that are sampled from the posterior, others
+            each time, instead of all with the most likely one. A plan has to be good then in several situations that
+            may be the case, and a robot that is stuck tries what it would do in another one.
     """
     robots, members = len(memory.weight), model.members
 
     # h_likely = argmax log p(D_M | theta_meta, h) over the candidates (line 6).
     log_posterior = belief.log_posterior
-    likely = _quantiles(belief.posterior, members if spread else 1).expand(-1, members)
+    likely = log_posterior.argmax(dim=1, keepdim=True).expand(-1, members)
+    if spread:
+        likely = systematic_sample(belief.posterior, members, offset=belief.adaptations * _GOLDEN_RATIO % 1.0)
     h_likely = candidates.h[torch.arange(members, device=likely.device), likely].flatten(0, 1)
 
     # theta*, h* = k steps from theta_meta, h_likely (line 7), each member of the ensemble by itself.
@@ -251,14 +281,6 @@ def adapt(
         h = _choose(better, h, start.h)
     adapted = replace(start, theta=theta, h=h)
     return adapted.where(adapted.is_finite(), start)  # steps that diverged are no steps
-
-
-def _quantiles(posterior: Tensor, n: int) -> Tensor:
-    """Candidates (B, n) at the quantiles 0, 1 / n, ... of posteriors (B, C), sorted from the most likely one on."""
-    descending, order = posterior.sort(dim=1, descending=True, stable=True)
-    at = torch.arange(n, device=posterior.device) / n
-    index = torch.searchsorted(descending.cumsum(dim=1), at.expand(len(posterior), n).contiguous(), right=True)
-    return order.gather(1, index.clamp(max=posterior.shape[1] - 1))
 
 
 def _split(data: Batch, newest: int) -> tuple[Batch, Batch]:

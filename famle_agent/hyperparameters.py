@@ -67,8 +67,8 @@ class Hyperparameters:
         adapt_embedding_lr: beta of online adaptation; None takes ``embedding_lr``.
         validation_size: The newest transitions of the memory, which gradient steps do not see and which decide whether
             the steps are kept; 0 keeps all, as the paper does.
-        spread_members: Whether the members of the ensemble start from situations of their own, which together cover
-            what is likely, instead of all from the most likely one (the paper's).
+        spread_members: Whether the members of the ensemble start from situations that are sampled from the posterior,
+            instead of all from the most likely one (the paper's).
         forget_at_reset: Whether a new episode empties the memory; damage outlasts an episode, so not by default.
         planner: ``"icem"``, ``"mppi"`` or ``"random_shooting"`` (the paper's).
         horizon: H, steps that the planner looks ahead.
