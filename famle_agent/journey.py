@@ -99,7 +99,7 @@ def run_journey_demo(
 
     Args:
         robot: The robot's name; its shipped model is used, or one is meta-learned where none is shipped.
-        situation: What is wrong with it: a preset or a description; empty is nothing beside its profile.
+        situation: What is wrong with it: a preset or a description; empty is the paper's where the robot has that.
         profile: What else differs from the simulator.
         out: Folder for the plot, the film and TensorBoard.
         seed: Seed of the robot and the planner.
@@ -113,7 +113,8 @@ def run_journey_demo(
     """
     console, env_id = Console(), known_robots()[robot].env_id
     # A wrong name should fail before minutes of learning.
-    env = gym.make(env_id, situation=situation or None, profile=profile, render_mode="rgb_array")
+    env = gym.make(env_id, profile=profile, render_mode="rgb_array")
+    env.get_wrapper_attr("set_situation")(situation or env.get_wrapper_attr("presets").get("paper"))
     agent = FAMLE(robot, seed=seed, **overrides)
     if agent.dynamics is None:
         agent.meta_learn(progress_bar=True, n_jobs=-1)

@@ -81,7 +81,8 @@ class QuadrupedEnv(GaitEnv):
 
     ## Situations
     ``locked_joints`` (held at their angle at rest), ``orientation_error``, ``friction`` and ``base_mass``.
-    :attr:`training_situations` holds 20: intact, each joint blocked, and seven errors of the yaw.
+    :attr:`training_situations` holds 20: intact, each joint blocked, and seven errors of the yaw. The
+    presets name the four blocked legs too, and ``"paper"`` is a blocked leg and a yaw error of 30 degrees.
 
     Args:
         goal: x and y in m; the robot starts at the origin and looks along +x.
@@ -113,7 +114,7 @@ class QuadrupedEnv(GaitEnv):
     training_situations = _TRAINING
     presets: ClassVar[Mapping[str, Situation]] = {
         situation.name: situation for situation in (*_TRAINING, *(blocked_leg(leg) for leg in range(len(LEGS))))
-    }
+    } | {"paper": Situation(locked_joints=(9, 10, 11), orientation_error=math.radians(30), name="paper")}
 
     def __init__(
         self,

@@ -220,7 +220,7 @@ def test_training_situations_are_intact_each_joint_blocked_and_yaw_errors() -> N
 def test_presets_are_known_by_name(make: Make) -> None:
     env = make()
     names = {s.name for s in QuadrupedEnv.training_situations} | {f"{leg} leg blocked" for leg in LEGS}
-    assert set(QuadrupedEnv.presets) == names
+    assert set(QuadrupedEnv.presets) == names | {"paper"}
     for name, situation in QuadrupedEnv.presets.items():
         assert env.reset(options={"situation": name})[1]["situation"] == name
         assert env.situation == situation
