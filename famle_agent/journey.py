@@ -15,6 +15,7 @@ from rich.table import Table
 from stable_baselines3.common.logger import configure
 
 from famle_agent.agent import ModelBasedAgent
+from famle_agent.contest import with_and_without_adaptation
 from famle_agent.dashboard import encode_gif, log_gif, log_posterior
 from famle_agent.famle import FAMLE
 from famle_agent.hyperparameters import known_robots
@@ -116,14 +117,10 @@ def run_journey_demo(
     env = gym.make(env_id, profile=profile, render_mode="rgb_array")
     env.get_wrapper_attr("set_situation")(situation or env.get_wrapper_attr("presets").get("paper"))
     agent = FAMLE(robot, seed=seed, **overrides)
-    if agent.dynamics is None:
-        agent.meta_learn(progress_bar=True, n_jobs=-1)
-    out.mkdir(parents=True, exist_ok=True)
-    agent.save(out / "agent.zip")
-    frozen = FAMLE.load(out / "agent.zip", adapt_every=0)
+    agents = with_and_without_adaptation(agent, out)
 
     runs = {}
-    for name, who in (("with adaptation", agent), ("without adaptation", frozen)):
+    for name, who in agents.items():
         with console.status(f"{robot} walks {name} ..."):
             runs[name] = _run(who, env, seed, out / "tensorboard" / name.replace(" ", "_"))
     title = f"{env_id}, {env.get_wrapper_attr('situation').label}, profile {profile!r}"

@@ -15,6 +15,7 @@ from rich.table import Table
 from stable_baselines3.common.logger import configure
 
 from famle_agent.agent import ModelBasedAgent
+from famle_agent.contest import with_and_without_adaptation
 from famle_agent.dashboard import encode_gif, log_gif, log_posterior
 from famle_agent.famle import FAMLE
 from famle_agent.hyperparameters import known_robots
@@ -115,15 +116,11 @@ def run_walking_demo(
     console, env_id = Console(), known_robots()[robot].env_id
     gym.make(env_id, situation=situation).close()  # a wrong name should fail before minutes of learning
     agent = FAMLE(robot, seed=seed, **overrides)
-    if agent.dynamics is None:
-        agent.meta_learn(progress_bar=True, n_jobs=-1)
-    out.mkdir(parents=True, exist_ok=True)
-    agent.save(out / "agent.zip")
-    frozen = FAMLE.load(out / "agent.zip", adapt_every=0)
+    agents = with_and_without_adaptation(agent, out)
 
     env = gym.make(env_id, render_mode="rgb_array", max_episode_steps=steps)
     runs = {}
-    for name, who in (("with adaptation", agent), ("without adaptation", frozen)):
+    for name, who in agents.items():
         with console.status(f"{robot} runs {name} ..."):
             runs[name] = _run(who, env, situation, steps, break_at, seed, out / "tensorboard" / name.replace(" ", "_"))
     rate = 1.0 / env.get_wrapper_attr("control_period")
