@@ -25,7 +25,8 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.harness import Replicate, Result, load_results, run_replicates
+from benchmarks.harness import Replicate, Result, check_methods, load_results, run_replicates
+from benchmarks.methods import shipped
 from benchmarks.report import by_method, interquartile_mean, quartiles
 from famle_agent import FAMLE, FAMLEWrapper
 from famle_agent.plots import style
@@ -112,13 +113,10 @@ def untrained(seed: int) -> Situation:
     return Situation(motor_gain=tuple(gain))
 
 
-def shipped(seed: int, members: int | None = None, **overrides: Any) -> FAMLE:
-    """The agent that the package ships."""
-    agent = FAMLE("ant", seed=seed, device="cpu", **overrides)
-    if agent.dynamics is None:
-        raise RuntimeError("The package ships no model that fits; make it with: famle meta-learn --robot ant")
-    if members is not None:
-        agent.dynamics = agent.dynamics.with_members(members)
+def with_members(task: Task, members: int) -> FAMLE:
+    """The shipped agent with fewer members."""
+    agent = shipped("ant", task.seed)
+    agent.dynamics = agent._require_dynamics().with_members(members)
     return agent
 
 
@@ -177,10 +175,10 @@ class Task:
 
 METHODS: dict[str, Callable[[Task], FAMLE]] = {
     **{
-        name: partial(lambda task, overrides: shipped(task.seed, **overrides), overrides=o)
+        name: partial(lambda task, overrides: shipped("ant", task.seed, **overrides), overrides=o)
         for name, o in VARIANTS.items()
     },
-    **{f"members-{n}": partial(lambda task, n: shipped(task.seed, n), n=n) for n in (1, 2, 3)},
+    **{f"members-{n}": partial(with_members, members=n) for n in (1, 2, 3)},
     "without-embeddings": without_embeddings,
     "oracle": oracle,
 }
@@ -260,9 +258,7 @@ def plot_speeds(results: list[Result], title: str, path: Path) -> None:
 def main(args: Args) -> None:
     """Runs and reports."""
     methods = args.methods or DEFAULT_METHODS[args.experiment]
-    for method in methods:
-        if method not in METHODS:
-            raise ValueError(f"There is no method {method!r}. Methods: {', '.join(METHODS)}.")
+    check_methods(methods, METHODS)
     folder = args.out / f"ant-{args.experiment}"
     for method in methods:
         tasks = [Task(seed, damage_of(args.experiment, seed), args) for seed in range(args.replicates)]

@@ -19,8 +19,9 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from benchmarks.ant import ADAPTS, damage_of, shipped
+from benchmarks.ant import ADAPTS, damage_of
 from benchmarks.harness import provenance, write_json
+from benchmarks.methods import shipped
 from famle_agent import FAMLE, Transitions
 from famle_agent.adaptation import Belief, Candidates, Memory, adapt, prior, window_posterior
 from famle_agent.dynamics import Batch, Dynamics
@@ -146,7 +147,7 @@ def learning_curve(agent: FAMLE, data: Transitions, seen: Sequence[int]) -> list
 def main(args: Args) -> None:
     """Measures, prints and stores."""
     torch.set_num_threads(1)
-    start, agent = time.perf_counter(), shipped(seed=0)
+    start, agent = time.perf_counter(), shipped("ant", seed=0)
     training = list(agent.get_env().get_attr("training_situations")[0])  # type: ignore[union-attr]
     n = args.windows * max(args.sizes)
     named = {}

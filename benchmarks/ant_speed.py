@@ -20,8 +20,9 @@ from rich.console import Console
 from rich.table import Table
 from torch import nn
 
-from benchmarks.ant import ENV_ID, shipped
+from benchmarks.ant import ENV_ID
 from benchmarks.harness import provenance, write_json
+from benchmarks.methods import shipped
 from benchmarks.speed import in_turn
 from famle_agent import FAMLEWrapper
 from famle_agent.dynamics import Batch, Dynamics, expand
@@ -71,7 +72,7 @@ def environment(repeats: int) -> dict[str, float]:
 def control_step(steps: int, threads: int) -> dict[str, float]:
     """A whole control step on an ant that breaks in mid-run: plan, inference and simulation."""
     torch.set_num_threads(threads)
-    agent = shipped(seed=0)
+    agent = shipped("ant", seed=0)
     env = FAMLEWrapper(gym.make(ENV_ID, max_episode_steps=steps), agent)
     milliseconds = 1e3 * run_and_break(env, "joint 2 dead, yaw sensor off by 60 deg", steps, steps // 3, 0).seconds[10:]
     period = 1e3 * env.get_wrapper_attr("control_period")
@@ -88,7 +89,7 @@ def control_step(steps: int, threads: int) -> dict[str, float]:
 
 def planning(repeats: int) -> dict[str, float]:
     """Our plan against the paper's 10,000 random candidates, on the shipped model."""
-    ours, paper = shipped(0), shipped(0, planner="random_shooting", candidates=10_000)
+    ours, paper = shipped("ant", 0), shipped("ant", 0, planner="random_shooting", candidates=10_000)
     obs, _ = gym.make(ENV_ID).reset(seed=0)
     plan, shooting = in_turn(max(3, repeats // 10), lambda: ours.predict(obs), lambda: paper.predict(obs))
     return {"our plan (ms)": 1e3 * plan, "random shooting 10,000 (ms)": 1e3 * shooting, "ratio": shooting / plan}

@@ -16,7 +16,7 @@ from typing import Any
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
-__all__ = ["Replicate", "Result", "load_results", "provenance", "run_replicates", "write_json"]
+__all__ = ["Replicate", "Result", "check_methods", "load_results", "provenance", "run_replicates", "write_json"]
 
 Result = dict[str, Any]
 _PACKAGES = ("famle", "gymnasium", "matplotlib", "numpy", "pybullet", "scipy", "stable-baselines3", "torch")
@@ -55,6 +55,17 @@ def run_replicates(replicates: Iterable[Replicate], folder: Path, jobs: int) -> 
     done = Parallel(n_jobs=jobs, return_as="generator_unordered")(calls)
     for name in (bar := tqdm(done, total=len(todo), desc=str(folder), unit="replicate")):
         bar.set_postfix_str(name)
+
+
+def check_methods(methods: Iterable[str], known: Iterable[str]) -> None:
+    """Refuses methods that are not known, before anything runs.
+
+    Raises:
+        ValueError: There is one.
+    """
+    for method in methods:
+        if method not in known:
+            raise ValueError(f"There is no method {method!r}. Methods: {', '.join(known)}.")
 
 
 def load_results(folder: Path) -> list[Result]:

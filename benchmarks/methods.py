@@ -17,7 +17,7 @@ from benchmarks.harness import Result
 from famle_agent import FAMLE
 from famle_envs import Situation
 
-__all__ = ["METHODS", "Task"]
+__all__ = ["METHODS", "Task", "shipped"]
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,14 @@ def oracle(task: Task, seed: int) -> Result:
     agent = FAMLE(task.robot, seed=seed, device="cpu", transitions_per_situation=n, adapt_every=0)
     agent.meta_learn([task.situation])
     return _live(agent, task, seed)
+
+
+def shipped(robot: str, seed: int, **overrides: Any) -> FAMLE:
+    """The agent that the package ships."""
+    agent = FAMLE(robot, seed=seed, device="cpu", **overrides)
+    if agent.dynamics is None:
+        raise RuntimeError(f"The package ships no model that fits; make it with: famle meta-learn --robot {robot}")
+    return agent
 
 
 def ppo(task: Task, seed: int) -> Result:

@@ -19,14 +19,14 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.gait_robots import METHODS, Task, run
-from benchmarks.harness import Replicate, Result, load_results, run_replicates
+from benchmarks.harness import Replicate, Result, check_methods, load_results, run_replicates
 from benchmarks.report import by_method, quartiles
 from famle_agent.plots import plot_paths
 from famle_envs import Situation
 from famle_envs.minitaur import REALITY
 
 DEFAULT_METHODS = {
-    "reality": ("famle", "famle-frozen", "famle-nearest", "one-simulator", "oracle"),
+    "reality": ("famle", "famle-frozen", "famle-nearest", "famle-likeliest", "one-simulator", "oracle"),
     "home": ("famle", "one-simulator"),
 }
 
@@ -75,9 +75,9 @@ def summary(results: list[Result], experiment: str) -> Table:
 def main(args: Args) -> None:
     """Runs and reports."""
     folder = args.out / f"minitaur-{args.experiment}"
-    for method in args.methods or DEFAULT_METHODS[args.experiment]:
-        if method not in METHODS:
-            raise ValueError(f"There is no method {method!r}. Methods: {', '.join(METHODS)}.")
+    methods = args.methods or DEFAULT_METHODS[args.experiment]
+    check_methods(methods, METHODS)
+    for method in methods:
         tasks = [task_of(args.experiment, seed, args) for seed in range(args.replicates)]
         run_replicates([Replicate(method, task.seed, partial(run, method, task)) for task in tasks], folder, args.jobs)
     results = load_results(folder)

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.gait_robots import METHODS, Task, run
-from benchmarks.harness import Replicate, Result, load_results, run_replicates
+from benchmarks.harness import Replicate, Result, check_methods, load_results, run_replicates
 from benchmarks.report import by_method
 from famle_agent.plots import plot_paths
 from famle_envs import Situation
@@ -28,8 +28,9 @@ from famle_envs.quadruped import LEGS, REALITY, blocked_leg
 
 YAW = math.radians(30)
 PAPER = {"yaw": "32.6 +- 2.3", "leg": "43.1 +- 6.4", "both": "41.6 +- 7.7"}
+PARTS = ("famle", "famle-frozen", "famle-nearest", "famle-likeliest")
 DEFAULT_METHODS = {
-    "later": ("famle", "famle-frozen", "famle-nearest"),
+    "later": PARTS,
     "gap-home": ("one-simulator", "famle"),
     "gap-reality": ("one-simulator", "famle"),
 }
@@ -86,11 +87,10 @@ def summary(results: list[Result], experiment: str) -> Table:
 def main(args: Args) -> None:
     """Runs and reports."""
     for experiment in args.experiments:
-        methods = args.methods or DEFAULT_METHODS.get(experiment, ("famle", "famle-frozen", "famle-nearest", "oracle"))
+        methods = args.methods or DEFAULT_METHODS.get(experiment, (*PARTS, "oracle"))
+        check_methods(methods, METHODS)
         folder = args.out / f"quadruped-{experiment}"
         for method in methods:
-            if method not in METHODS:
-                raise ValueError(f"There is no method {method!r}. Methods: {', '.join(METHODS)}.")
             tasks = [task_of(experiment, seed, args) for seed in range(args.replicates)]
             replicates = [Replicate(method, task.seed, partial(run, method, task)) for task in tasks]
             run_replicates(replicates, folder, args.jobs)

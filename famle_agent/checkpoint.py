@@ -19,7 +19,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from famle_agent.envs import make_env
+from famle_agent.envs import env_attribute, make_env
 from famle_agent.hyperparameters import Hyperparameters
 from famle_agent.observation import DIMS
 from famle_agent.online import OnlineState
@@ -43,7 +43,6 @@ _DAMAGE = (
     *(zipfile.BadZipFile, zlib.error, EOFError, KeyError, SafetensorError),
     *(ValueError, RuntimeError, NotImplementedError),  # what zipfile and json make of flipped bits
 )
-_NO_MATTER_TO_A_MODEL = ("situation", "profile", "goal", "success_radius", "terminate_when_fallen", "render_mode")
 _META, _TENSORS = "agent.json", "tensors.safetensors"
 
 Agent = TypeVar("Agent", bound="ModelBasedAgent")
@@ -190,7 +189,7 @@ def load_pretrained(agent: ModelBasedAgent, file: File) -> None:
     alike = (
         meta["class"] == type(agent).__name__
         and all(tuple(meta.get(name, ())) == dims for name, dims in agent._dims.items())
-        and _world(meta["env"]) == _world(agent._env_spec)
+        and _world(meta["env"], agent) == _world(agent._env_spec, agent)
         and Hyperparameters.from_dict(meta["hyperparameters"]).learnt_alike(agent.hyperparameters)
     )
     if alike:
@@ -199,11 +198,12 @@ def load_pretrained(agent: ModelBasedAgent, file: File) -> None:
         _restore_tensors(agent, weights, None)
 
 
-def _world(env: dict[str, Any] | None) -> dict[str, Any] | None:
+def _world(env: dict[str, Any] | None, agent: ModelBasedAgent) -> dict[str, Any] | None:
     """What of an environment's description matters to a model of all its situations."""
-    if env is None:
+    if env is None or agent.env is None:
         return None
-    kwargs = {key: value for key, value in env["kwargs"].items() if key not in _NO_MATTER_TO_A_MODEL}
+    other = env_attribute(agent.env, "task_arguments", ())
+    kwargs = {key: value for key, value in env["kwargs"].items() if key not in other}
     return {"id": env["id"], "kwargs": kwargs}
 
 

@@ -15,6 +15,7 @@ from rich.table import Table
 from stable_baselines3.common.logger import Logger, configure
 
 from famle_agent.agent import ModelBasedAgent
+from famle_agent.contest import with_and_without_adaptation
 from famle_agent.dashboard import encode_gif, log_gif, log_posterior
 from famle_agent.famle import FAMLE
 from famle_agent.hyperparameters import known_robots
@@ -110,11 +111,8 @@ def run_demo(
     start = time.perf_counter()
     agent.meta_learn(progress_bar=True)
     console.print(f"Meta-learned {len(agent.situations)} situations in {time.perf_counter() - start:.0f} s.")
-    agent.save(out / "agent.zip")
-    frozen = FAMLE.load(out / "agent.zip", adapt_every=0)
-
     results = {}
-    for name, who in (("with adaptation", agent), ("without adaptation", frozen)):
+    for name, who in with_and_without_adaptation(agent, out).items():
         logger = configure(str(out / "tensorboard" / name.replace(" ", "_")), ["tensorboard"])
         with console.status(f"Running {name} ..."):
             results[name] = _run(who, env_id, situation, episodes, seed, logger)

@@ -308,10 +308,8 @@ class Simulator:
         (first_weight, first_bias), (last_weight, last_bias) = network[0], network[-1]
         from_features = first_weight[:, : model.n_features] / model.input_std[:, None]
         bias = first_bias - (model.input_mean @ from_features)[:, None]
-        first = (
-            torch.cat([model.layout.weights_for_inputs(from_features), first_weight[:, model.n_features :]], dim=1),
-            bias,
-        )
+        weights = [model.layout.weights_for_inputs(from_features), first_weight[:, model.n_features :]]
+        first = torch.cat(weights, dim=1), bias
         last = (last_weight * model.target_std, last_bias * model.target_std + model.target_mean)
         self._network = [first, *network[1:-1], last]
 
@@ -322,7 +320,7 @@ class Simulator:
             obs: Observations, (B, n, obs_dim).
             action: Actions in [-1, 1], (B, n, action_dim).
         """
-        inputs = torch.cat([self._model.layout.inputs(obs), action], dim=-1)
+        inputs = torch.cat([*self._model.layout.inputs(obs), action], dim=-1)
         change = self._model.forward(self._network, inputs)
         return self._model.layout.advance(obs, change)
 

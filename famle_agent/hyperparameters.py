@@ -36,6 +36,8 @@ class Hyperparameters:
         round_transitions: Transitions simulated in each training situation in each such round.
         hidden: Width of each hidden layer of the dynamics model.
         embedding_dim: Size of a situation embedding h.
+        egocentric: Whether the model sees a robot's pose on a floor from the robot itself, where the environment names
+            it (``pose_dims``); the paper's does not.
         gate_actions: Whether h scales the actions inside the model; the paper's network only concatenates it.
         interaction_rank: Rank of the products of h and the inputs in the first layer; 0 is the paper's network.
         members: Networks of the ensemble, each with its own embeddings; 1 is the paper's.
@@ -89,6 +91,7 @@ class Hyperparameters:
     round_transitions: int = 1000
     hidden: tuple[int, ...] = (200, 200)
     embedding_dim: int = 5
+    egocentric: bool = True
     gate_actions: bool = True
     interaction_rank: int = 0
     members: int = 1

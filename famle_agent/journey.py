@@ -33,7 +33,7 @@ class Journey:
 
     Attributes:
         path: Where the body really was before the first action and after each, x and y in m, (n + 1, 2).
-        seconds: Wall time of the thinking for each action, (n,).
+        seconds: Wall time of each plan, (n,); adapting, which the wrapper does after the action, is not in it.
         believed: The most likely situation after each action.
         reached: Whether the robot reached its goal, where it has one.
         fell: Whether the episode ended without that.

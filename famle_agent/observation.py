@@ -130,8 +130,8 @@ class ObservationLayout:
         heading = obs[..., self.pose_dims[2]]
         return heading.sin(), heading.cos()
 
-    def inputs(self, obs: Tensor) -> Tensor:
-        """As :meth:`features` with less copying, for :meth:`weights_for_inputs`.
+    def inputs(self, obs: Tensor) -> list[Tensor]:
+        """As :meth:`features` in parts that copy little, for :meth:`weights_for_inputs`; to be concatenated in order.
 
         All of the observation goes in as it is, and all 16 products of a quaternion instead of the 10 that differ.
         """
@@ -142,7 +142,7 @@ class ObservationLayout:
         if self.quaternion_dims:
             q = _take(obs, self.quaternion_dims)
             parts.append((q[..., None] * q[..., None, :]).flatten(-2))
-        return torch.cat(parts, dim=-1) if len(parts) > 1 else obs
+        return parts
 
     def weights_for_inputs(self, weight: Tensor) -> Tensor:
         """First-layer weights for :meth:`inputs` from those for :meth:`features`, (B, n_features, out).

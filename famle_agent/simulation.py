@@ -69,7 +69,7 @@ class SimulationLearner(BaseAlgorithm):
             environment's ``quaternion_dims``.
         pose_dims: x, y and heading of a robot on a floor, the heading as an angle or as its sine and its cosine: with
             them, the model knows that a robot moves alike wherever it stands and looks. None takes the environment's
-            ``pose_dims``, but in ``"paper"`` mode, whose model knows nothing of the kind.
+            ``pose_dims`` where the settings are ``egocentric``.
         tensorboard_log: Folder for TensorBoard; None logs nothing there.
         verbose: 0 for silence, 1 for information, 2 for debugging.
         device: ``"auto"``, ``"cpu"`` or ``"cuda"``.
@@ -172,10 +172,9 @@ class SimulationLearner(BaseAlgorithm):
         """The special dimensions of an observation by name: those that were given, else the environment's."""
         names = dict(zip(DIMS, given, strict=True))
         known = {name: () if self.env is None else tuple(env_attribute(self.env, name, ())) for name in DIMS}
-        if self.mode == "paper":
-            # The paper's model knows nothing of poses; a heading that is an angle is still one.
-            x_y_heading = known.pop("pose_dims")
-            known |= {"pose_dims": (), "angle_dims": known["angle_dims"] + x_y_heading[2:] * (len(x_y_heading) == 3)}
+        if not self.hyperparameters.egocentric:
+            heading = known["pose_dims"][2:]
+            known |= {"pose_dims": (), "angle_dims": known["angle_dims"] + (heading if len(heading) == 1 else ())}
         dims = {name: known[name] if chosen is None else tuple(chosen) for name, chosen in names.items()}
         if self.env is not None:
             ObservationLayout(self.observation_space.shape[0], **dims)  # refuses what cannot be

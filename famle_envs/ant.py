@@ -91,6 +91,7 @@ class AntEnv(BulletEnv):
     substeps = _SUBSTEPS
     solver_iterations = 50
     quaternion_dims = (1, 2, 3, 4)
+    task_arguments = BulletEnv.task_arguments | {"terminate_when_fallen"}
     training_situations = _TRAINING
     presets: ClassVar[Mapping[str, Situation]] = {situation.name: situation for situation in _TRAINING} | {
         "paper": Situation(motor_gain=(1, 1, 0), orientation_error=math.radians(45), name="paper")

@@ -68,6 +68,8 @@ class BulletEnv(gym.Env[Array, Array]):
     """The four observation dimensions of a unit quaternion, where q and -q are the same orientation."""
     pose_dims: ClassVar[tuple[int, ...]] = ()
     """x, y and heading of a robot on a floor; the heading as an angle, or as its sine and its cosine."""
+    task_arguments: ClassVar[frozenset[str]] = frozenset({"situation", "render_mode"})
+    """Arguments of the constructor that say what the robot should do and in what situation, not what it is."""
     training_situations: ClassVar[tuple[Situation, ...]]
     """The situations of the paper's meta-training."""
     presets: ClassVar[Mapping[str, Situation]]

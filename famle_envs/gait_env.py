@@ -38,6 +38,7 @@ class GaitEnv(BulletEnv):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012 (Gymnasium's own type)
 
     supported_faults = frozenset({"locked_joints", "orientation_error", "friction", "base_mass"})
+    task_arguments = BulletEnv.task_arguments | {"profile"}
     time_step = 0.01
     physics_steps = 100
     substeps = 2

@@ -81,8 +81,8 @@ class QuadrupedEnv(GaitEnv):
 
     ## Situations
     ``locked_joints`` (held at their angle at rest), ``orientation_error``, ``friction`` and ``base_mass``.
-    :attr:`training_situations` holds 20: intact, each joint blocked, and seven errors of the yaw. The
-    presets name the four blocked legs too, and ``"paper"`` is a blocked leg and a yaw error of 30 degrees.
+    :attr:`training_situations` holds 20: intact, each joint blocked, and seven errors of the yaw. The presets name the
+    four blocked legs too, and ``"paper"`` is a blocked leg and a yaw error of 30 degrees.
 
     Args:
         goal: x and y in m; the robot starts at the origin and looks along +x.
@@ -111,6 +111,7 @@ class QuadrupedEnv(GaitEnv):
     rest_angles = np.zeros(_N_JOINTS)
     profiles: ClassVar[Mapping[str, Profile]] = {REALITY.name: REALITY}
     pose_dims = (0, 1, 2, 3)
+    task_arguments = GaitEnv.task_arguments | {"goal", "success_radius"}
     training_situations = _TRAINING
     presets: ClassVar[Mapping[str, Situation]] = {
         situation.name: situation for situation in (*_TRAINING, *(blocked_leg(leg) for leg in range(len(LEGS))))

@@ -77,6 +77,7 @@ class ReacherEnv(BulletEnv):
     time_step = 0.004
     physics_steps = 25
     angle_dims = tuple(range(N_JOINTS))
+    task_arguments = BulletEnv.task_arguments | {"goal"}
     training_situations = _TRAINING
     presets: ClassVar[Mapping[str, Situation]] = {situation.name: situation for situation in _TRAINING} | {
         "paper": Situation(motor_gain=(-1, 1, 1, 0, 1), name="paper")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 from unittest.mock import patch
@@ -21,6 +22,8 @@ from famle_agent.dynamics import Dynamics, Theta
 from famle_agent.inner_loop import InnerLoop
 from famle_agent.observation import DIMS, ObservationLayout
 from famle_envs.gait_env import GaitEnv
+from famle_envs.quadruped import QuadrupedEnv
+from famle_envs.reality import Profile
 
 Array = npt.NDArray[Any]
 
@@ -44,6 +47,26 @@ def run(agent: FAMLE, env: gym.Env[Any, Any], steps: int, seed: int = 0) -> Onli
 
 
 # --- robots that walk a gait a second -----------------------------------------------------------------------
+
+
+@contextmanager
+def making(robot: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
+    """Makes robots, already reset, and closes them in the end."""
+    made: list[Any] = []
+
+    def make(*args: Any, **kwargs: Any) -> Any:
+        made.append(robot(*args, **kwargs))
+        made[-1].reset(seed=0)
+        return made[-1]
+
+    yield make
+    for env in made:
+        env.close()
+
+
+def quadruped_with(situation: Any = None, **ingredients: Any) -> QuadrupedEnv:
+    """A quadruped with a profile of some ingredients."""
+    return QuadrupedEnv(situation=situation, profile=Profile("test", **ingredients) if ingredients else "simulator")
 
 
 def walk(env: GaitEnv, action: Any, gaits: int = 1) -> Array:

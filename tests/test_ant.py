@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from famle_envs import Situation
 from famle_envs.ant import AntEnv
+from tests.helpers import making
 
 Array = npt.NDArray[Any]
 Make = Callable[..., AntEnv]
@@ -34,17 +35,8 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 @pytest.fixture
 def make() -> Iterator[Make]:
-    """Makes bare ants, already reset, and closes them in the end."""
-    made: list[AntEnv] = []
-
-    def make_ant(**kwargs: Any) -> AntEnv:
-        made.append(AntEnv(**kwargs))
-        made[-1].reset(seed=0)
-        return made[-1]
-
-    yield make_ant
-    for env in made:
-        env.close()
+    with making(AntEnv) as make_robot:
+        yield make_robot
 
 
 def commands(steps: int = 60, seed: int = 0) -> Array:

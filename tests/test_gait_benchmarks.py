@@ -45,13 +45,14 @@ def test_replicate_is_stored_with_its_profile_and_summed_up(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("robot", ["quadruped", "minitaur"])
-@pytest.mark.parametrize("method", ["famle", "famle-frozen", "famle-nearest", "famle-sums"])
+@pytest.mark.parametrize("method", ["famle", "famle-frozen", "famle-nearest", "famle-likeliest"])
 def test_methods_are_the_shipped_agent_with_something_changed(robot: str, method: str, tmp_path: Path) -> None:
     agent: Any = METHODS[method](Task(robot, 3, Situation(), "reality", tmp_path))
     settings = agent.hyperparameters
     assert agent.dynamics is not None
     assert (settings.adapt_every == 0) == (method == "famle-frozen")
-    assert (settings.adaptation().steps == 0) == (method in ("famle-nearest", "famle-sums"))
+    assert (settings.adaptation().steps == 0) == (method == "famle-nearest")
+    assert settings.spread_members == (method in ("famle", "famle-frozen"))
     agent.get_env().close()
 
 

@@ -19,7 +19,7 @@ from stable_baselines3.common.env_checker import check_env as check_with_sb3
 from famle_envs import Situation
 from famle_envs.gait_env import GaitEnv
 from famle_envs.minitaur import MinitaurEnv
-from tests.helpers import joint_angles, masses, put, walk, watch
+from tests.helpers import joint_angles, making, masses, put, walk, watch
 
 Array = npt.NDArray[Any]
 Make = Callable[..., MinitaurEnv]
@@ -34,17 +34,8 @@ CLOSURE = ((0.0, 0.005, 0.2), (0.0, 0.01, 0.2))
 
 @pytest.fixture
 def make() -> Iterator[Make]:
-    """Makes bare robots, already reset, and closes them in the end."""
-    made: list[MinitaurEnv] = []
-
-    def make_env(**kwargs: Any) -> MinitaurEnv:
-        made.append(MinitaurEnv(**kwargs))
-        made[-1].reset(seed=0)
-        return made[-1]
-
-    yield make_env
-    for env in made:
-        env.close()
+    with making(MinitaurEnv) as make_robot:
+        yield make_robot
 
 
 def follow(env: MinitaurEnv, seed: int = 0, gaits: int = 2) -> Array:

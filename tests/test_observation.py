@@ -89,7 +89,7 @@ def test_weights_for_inputs_do_to_inputs_what_the_weights_do_to_features(
     torch.manual_seed(seed)
     weight = torch.randn(size, layout.n_features, out, dtype=torch.float64)
     folded = layout.weights_for_inputs(weight)
-    torch.testing.assert_close(layout.inputs(obs) @ folded, layout.features(obs) @ weight, **EXACT)
+    torch.testing.assert_close(torch.cat(layout.inputs(obs), dim=-1) @ folded, layout.features(obs) @ weight, **EXACT)
 
 
 # --- What a model predicts ---

@@ -14,7 +14,7 @@ from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
 from famle_envs import Situation
 from famle_envs.quadruped import LEGS, QuadrupedEnv, blocked_leg
-from tests.helpers import joint_angles, masses, walk, watch
+from tests.helpers import joint_angles, making, masses, walk, watch
 
 Array = npt.NDArray[Any]
 Make = Callable[..., QuadrupedEnv]
@@ -29,17 +29,8 @@ ALL_JOINTS = np.array([0.3, 0.7, 1.0, 0.0])
 
 @pytest.fixture
 def make() -> Iterator[Make]:
-    """Makes bare robots, already reset, and closes them in the end."""
-    made: list[QuadrupedEnv] = []
-
-    def make_env(**kwargs: Any) -> QuadrupedEnv:
-        made.append(QuadrupedEnv(**kwargs))
-        made[-1].reset(seed=0)
-        return made[-1]
-
-    yield make_env
-    for env in made:
-        env.close()
+    with making(QuadrupedEnv) as make_robot:
+        yield make_robot
 
 
 def follow(env: QuadrupedEnv, seed: int = 0, gaits: int = 3) -> Array:

@@ -13,7 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from famle_envs.quadruped import QuadrupedEnv
 from famle_envs.reality import Profile
-from tests.helpers import put, walk
+from tests.helpers import making, put, walk
 
 Array = npt.NDArray[Any]
 Make = Callable[..., QuadrupedEnv]
@@ -23,17 +23,8 @@ STAND, FORWARDS = np.array([0.0, 0.0, -1.0, 0.0]), np.array([0.0, 1.0, 0.0, 0.0]
 
 @pytest.fixture
 def make() -> Iterator[Make]:
-    """Makes bare robots, already reset, and closes them in the end."""
-    made: list[QuadrupedEnv] = []
-
-    def make_env(**kwargs: Any) -> QuadrupedEnv:
-        made.append(QuadrupedEnv(**kwargs))
-        made[-1].reset(seed=0)
-        return made[-1]
-
-    yield make_env
-    for env in made:
-        env.close()
+    with making(QuadrupedEnv) as make_robot:
+        yield make_robot
 
 
 # --- Reward ---

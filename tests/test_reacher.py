@@ -9,6 +9,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from famle_envs import Situation
 from famle_envs.reacher import ReacherEnv
+from tests.helpers import making
 
 JOINTS = range(5)
 TIP = slice(10, 12)
@@ -20,17 +21,8 @@ Make = Callable[..., ReacherEnv]
 
 @pytest.fixture
 def make() -> Iterator[Make]:
-    """Makes bare environments, already reset, and closes them in the end."""
-    made: list[ReacherEnv] = []
-
-    def make_env(**kwargs: Any) -> ReacherEnv:
-        made.append(ReacherEnv(**kwargs))
-        made[-1].reset(seed=0)
-        return made[-1]
-
-    yield make_env
-    for env in made:
-        env.close()
+    with making(ReacherEnv) as make_robot:
+        yield make_robot
 
 
 def run(env: ReacherEnv, action: np.ndarray, steps: int) -> np.ndarray:

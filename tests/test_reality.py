@@ -14,7 +14,7 @@ from famle_envs.gait_env import GaitEnv
 from famle_envs.minitaur import MinitaurEnv
 from famle_envs.quadruped import QuadrupedEnv
 from famle_envs.reality import SIMULATOR, Profile, resolve_profile
-from tests.helpers import inertias, masses, walk
+from tests.helpers import inertias, making, masses, quadruped_with, walk
 
 Make = Callable[..., QuadrupedEnv]
 
@@ -24,18 +24,8 @@ ROBOTS: list[type[GaitEnv]] = [QuadrupedEnv, MinitaurEnv]
 
 @pytest.fixture
 def make() -> Iterator[Make]:
-    """Makes bare quadrupeds with a profile of some ingredients, already reset, and closes them in the end."""
-    made: list[QuadrupedEnv] = []
-
-    def make_env(situation: Any = None, **ingredients: Any) -> QuadrupedEnv:
-        profile = Profile("test", **ingredients) if ingredients else "simulator"
-        made.append(QuadrupedEnv(situation=situation, profile=profile))
-        made[-1].reset(seed=0)
-        return made[-1]
-
-    yield make_env
-    for env in made:
-        env.close()
+    with making(quadruped_with) as make_robot:
+        yield make_robot
 
 
 # --- Profiles by name ---

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 import pybullet
@@ -11,8 +10,7 @@ import pytest
 from famle_envs.gait_env import GaitEnv
 from famle_envs.gaits import trot
 from famle_envs.quadruped import QuadrupedEnv
-from famle_envs.reality import Profile
-from tests.helpers import joint_angles, joint_speeds, put, walk, watch
+from tests.helpers import joint_angles, joint_speeds, making, put, quadruped_with, walk, watch
 
 Make = Callable[..., QuadrupedEnv]
 
@@ -22,18 +20,8 @@ HIP = 0
 
 @pytest.fixture
 def make() -> Iterator[Make]:
-    """Makes bare quadrupeds with a profile of some ingredients, already reset, and closes them in the end."""
-    made: list[QuadrupedEnv] = []
-
-    def make_env(situation: Any = None, **ingredients: Any) -> QuadrupedEnv:
-        profile = Profile("test", **ingredients) if ingredients else "simulator"
-        made.append(QuadrupedEnv(situation=situation, profile=profile))
-        made[-1].reset(seed=0)
-        return made[-1]
-
-    yield make_env
-    for env in made:
-        env.close()
+    with making(quadruped_with) as make_robot:
+        yield make_robot
 
 
 def test_joints_follow_their_commands_leg_by_leg(make: Make) -> None:
