@@ -5,6 +5,7 @@ python -m benchmarks.ant --experiment break           # the same, striking in th
 python -m benchmarks.ant --experiment untrained       # kinds of damage that were not trained at all
 python -m benchmarks.ant --experiment intact --methods famle random-shooting --replicates 3
 python -m benchmarks.ant --experiment members         # ensembles of one to four
+python -m benchmarks.ant --experiment curves --replicates 10   # all methods over many episodes: the paper's figure 4
 
 Replicates share the shipped model; each has its own damage and its own seed of the robot and the planner. The oracle
 and the agent without embeddings are trained from scratch by their method.
@@ -12,7 +13,6 @@ and the agent without embeddings are trained from scratch by their method.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,10 +25,13 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.harness import Replicate, Result, check_methods, load_results, run_replicates
-from benchmarks.methods import shipped
-from benchmarks.report import by_method, interquartile_mean, quartiles
-from famle_agent import FAMLE, FAMLEWrapper
+from benchmarks import curves
+from benchmarks.compare import compare
+from benchmarks.harness import Options, Result, load_results
+from benchmarks.methods import METHODS, PPO_METHODS, Method, Task, famle
+from benchmarks.report import by_method, interquartile_mean, plot_curves, quartiles
+from benchmarks.report import summary as summary_of_curves
+from famle_agent import FAMLE, FAMLEWrapper, ModelBasedAgent
 from famle_agent.plots import style
 from famle_agent.walking import BrokenRun, run_and_break
 from famle_envs import Situation
@@ -56,25 +59,22 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 @dataclass(frozen=True)
-class Args:
-    """Runs replicates that are not stored yet, then reports on all that are."""
+class Args(Options):
+    """The ant: unseen damage, damage in the middle of a run, and the paper's figure 4."""
 
-    experiment: Literal["unseen", "break", "untrained", "intact", "members", "validation"] = "unseen"
-    """What happens to the robot."""
-    methods: tuple[str, ...] = ()
-    """Entries of METHODS; by default those that belong to the experiment."""
+    experiment: Literal["unseen", "break", "untrained", "intact", "members", "validation", "curves"] = "unseen"
+    """What happens to the robot; "curves" are episodes one after the other, the others are one episode."""
     replicates: int = 20
     """Damages, seeded 0, 1, ..."""
     steps: int = 1000
     """Robot steps of a replicate, all in one episode."""
-    jobs: int = 2
-    """Parallel processes."""
-    out: Path = Path("benchmarks/results")
-    """Folder of the results."""
-    cache: Path = Path("runs/agents")
-    """Folder of the agents that are trained here."""
+    curve_steps: int = 25_000
+    """Robot steps of the model-based methods in "curves"."""
+    ppo_steps: int = 1_000_000
+    """Robot steps of PPO in "curves"."""
 
 
+RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
 DEFAULT_METHODS: dict[str, tuple[str, ...]] = {
     "unseen": ("famle", "famle-frozen", "famle-nearest", "famle-h", "famle-theta"),
     "validation": ("famle", "famle-window", "famle-h", "famle-theta", "famle-validated"),
@@ -82,6 +82,7 @@ DEFAULT_METHODS: dict[str, tuple[str, ...]] = {
     "break": ("famle", "famle-window", "famle-frozen"),
     "untrained": ("famle", "famle-frozen", "famle-theta", "famle-validated"),
     "intact": ("famle",),
+    "curves": ("famle", "famle-frozen", *RIVALS, *PPO_METHODS, "oracle"),
 }
 
 
@@ -115,14 +116,14 @@ def untrained(seed: int) -> Situation:
 
 def with_members(task: Task, members: int) -> FAMLE:
     """The shipped agent with fewer members."""
-    agent = shipped("ant", task.seed)
+    agent = famle(task)
     agent.dynamics = agent._require_dynamics().with_members(members)
     return agent
 
 
 def oracle(task: Task) -> FAMLE:
     """The upper line: from scratch on the very test situation, 28,000 simulated steps of it."""
-    path = task.args.cache / f"ant-oracle-{task.args.experiment}-{task.seed}.zip"
+    path = task.cache / f"ant-oracle-{str(task.situation).replace(' ', '_')}-{task.seed}.zip"
     if not path.exists():
         agent = FAMLE(
             "ant",
@@ -141,7 +142,7 @@ def oracle(task: Task) -> FAMLE:
 
 def without_embeddings(task: Task) -> FAMLE:
     """One model of all situations, as FAMLE after two rounds; it can only follow by gradient steps on theta."""
-    path = task.args.cache / "ant-without-embeddings.zip"
+    path = task.cache / "ant-without-embeddings.zip"
     agent = FAMLE("ant", seed=0, device="cpu", compose=False)
     if not path.exists():
         settings, n = agent.hyperparameters, len(AntEnv.training_situations)
@@ -158,36 +159,23 @@ def without_embeddings(task: Task) -> FAMLE:
     return FAMLE.load(path, device="cpu", **ADAPTS)
 
 
-@dataclass(frozen=True)
-class Task:
-    """One replicate.
-
-    Attributes:
-        seed: Of the robot and the planner, and of the damage.
-        situation: The damage.
-        args: Of the benchmark.
-    """
-
-    seed: int
-    situation: Situation
-    args: Args
-
-
-METHODS: dict[str, Callable[[Task], FAMLE]] = {
-    **{
-        name: partial(lambda task, overrides: shipped("ant", task.seed, **overrides), overrides=o)
-        for name, o in VARIANTS.items()
-    },
-    **{f"members-{n}": partial(with_members, members=n) for n in (1, 2, 3)},
-    "without-embeddings": without_embeddings,
-    "oracle": oracle,
+ANT_METHODS = {
+    **METHODS,
+    **{name: Method(partial(famle, **overrides)) for name, overrides in VARIANTS.items()},
+    **{f"members-{n}": Method(partial(with_members, members=n)) for n in (1, 2, 3)},
+    "without-embeddings": Method(without_embeddings, without_embeddings),
+    "oracle": Method(oracle),
 }
-"""Agents by name."""
+"""What every robot can be run with, and what was asked of the ant alone."""
 
 
-def run(method: str, task: Task) -> Result:
+def run(method: str, task: Task, args: Args) -> Result:
     """One replicate: broken from the first step, or after 300 steps."""
-    agent, args = METHODS[method](task), task.args
+    agent = ANT_METHODS[method].agent(task)
+    if args.experiment == "curves":
+        return curves.run(agent, task, args.ppo_steps if method in PPO_METHODS else args.curve_steps)
+    if not isinstance(agent, ModelBasedAgent):
+        raise ValueError(f"{method} learns too little in one episode to be compared in it; see --experiment curves.")
     agent.set_random_seed(task.seed)
     break_at = 300 if args.experiment == "break" else 0
     env = FAMLEWrapper(gym.make(ENV_ID, max_episode_steps=args.steps), agent)
@@ -258,15 +246,16 @@ def plot_speeds(results: list[Result], title: str, path: Path) -> None:
 def main(args: Args) -> None:
     """Runs and reports."""
     methods = args.methods or DEFAULT_METHODS[args.experiment]
-    check_methods(methods, METHODS)
     folder = args.out / f"ant-{args.experiment}"
-    for method in methods:
-        tasks = [Task(seed, damage_of(args.experiment, seed), args) for seed in range(args.replicates)]
-        run_replicates([Replicate(method, task.seed, partial(run, method, task)) for task in tasks], folder, args.jobs)
-    results = load_results(folder)
-    title = f"Ant, {args.experiment}"
-    Console(width=160).print(summary(results, title))
-    plot_speeds(results, title, args.out / f"ant-{args.experiment}.png")
+    tasks = [Task("ant", seed, damage_of(args.experiment, seed), args.cache) for seed in range(args.replicates)]
+    compare(methods, tasks, partial(run, args=args), folder, args, ANT_METHODS)
+    results, title = load_results(folder), f"Ant, {args.experiment}"
+    if args.experiment == "curves":
+        Console(width=160).print(summary_of_curves(results, SOLVED, title, within=args.steps))
+        plot_curves(results, SOLVED, title, args.out / "ant-curves.png", args.curve_steps)
+    else:
+        Console(width=160).print(summary(results, title))
+        plot_speeds(results, title, args.out / f"ant-{args.experiment}.png")
 
 
 if __name__ == "__main__":

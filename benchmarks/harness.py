@@ -1,4 +1,4 @@
-"""Replicates: run in parallel processes, each stored as soon as it ends and skipped the next time."""
+"""Replicates: run in parallel, each stored as soon as it ends and skipped the next time."""
 
 from __future__ import annotations
 
@@ -16,10 +16,30 @@ from typing import Any
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
-__all__ = ["Replicate", "Result", "check_methods", "load_results", "provenance", "run_replicates", "write_json"]
+from famle_agent.cluster import Backend, parallel
+
+__all__ = ["Options", "Replicate", "Result", "load_results", "provenance", "run_replicates", "write_json"]
 
 Result = dict[str, Any]
 _PACKAGES = ("famle", "gymnasium", "matplotlib", "numpy", "pybullet", "scipy", "stable-baselines3", "torch")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What all benchmarks can be told. Each runs replicates that are not stored yet, then reports on all that are."""
+
+    methods: tuple[str, ...] = ()
+    """Entries of benchmarks.methods.METHODS; by default those that belong to the experiment."""
+    replicates: int = 10
+    """Seeds 0, 1, ..."""
+    jobs: int = 2
+    """Replicates that run at the same time."""
+    backend: Backend = "loky"
+    """Where they run: in processes on this machine, or in a Ray cluster (RAY_ADDRESS, or one that is started here)."""
+    out: Path = Path("benchmarks/results")
+    """Folder of the results."""
+    cache: Path = Path("runs/agents")
+    """Folder of the agents that are learnt in simulation."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +48,7 @@ class Replicate:
 
     Attributes:
         method: What is run.
-        seed: Seed of its data, its meta-training and its robot.
+        seed: Seed of its robot, and of what it learns for itself.
         run: Makes the result; picklable, and alone responsible for its seeds.
     """
 
@@ -41,31 +61,31 @@ class Replicate:
         return folder / f"{self.method}-{self.seed}.json"
 
 
-def run_replicates(replicates: Iterable[Replicate], folder: Path, jobs: int) -> None:
+def run_replicates(replicates: Iterable[Replicate], folder: Path, jobs: int, backend: Backend = "loky") -> None:
     """Runs what is not stored yet.
 
     Args:
         replicates: What to run.
         folder: Where the results go, one file a replicate.
-        jobs: Parallel processes.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    todo = [replicate for replicate in replicates if not replicate.path(folder).exists()]
-    calls = (delayed(_run_one)(replicate, folder, sys.argv) for replicate in todo)
-    done = Parallel(n_jobs=jobs, return_as="generator_unordered")(calls)
-    for name in (bar := tqdm(done, total=len(todo), desc=str(folder), unit="replicate")):
-        bar.set_postfix_str(name)
-
-
-def check_methods(methods: Iterable[str], known: Iterable[str]) -> None:
-    """Refuses methods that are not known, before anything runs.
+        jobs: Replicates that run at the same time.
+        backend: Where they run.
 
     Raises:
-        ValueError: There is one.
+        Exception: What a replicate raised, after all others have run and are stored.
     """
-    for method in methods:
-        if method not in known:
-            raise ValueError(f"There is no method {method!r}. Methods: {', '.join(known)}.")
+    todo = [replicate for replicate in replicates if not replicate.path(folder).exists()]
+    calls = (delayed(_run_one)(replicate) for replicate in todo)
+    failure: Exception | None = None
+    with parallel(backend), tqdm(total=len(todo), desc=str(folder), unit="replicate") as bar:
+        for replicate, result in Parallel(n_jobs=jobs, return_as="generator_unordered")(calls):
+            if isinstance(result, Exception):
+                failure = failure or result
+            else:
+                write_json(replicate.path(folder), result | provenance(sys.argv))
+            bar.set_postfix_str(f"{replicate.method}-{replicate.seed}")
+            bar.update()
+    if failure is not None:
+        raise failure
 
 
 def load_results(folder: Path) -> list[Result]:
@@ -98,15 +118,19 @@ def write_json(path: Path, value: Any) -> None:
     partial.replace(path)
 
 
-def _run_one(replicate: Replicate, folder: Path, argv: list[str]) -> str:
+def _run_one(replicate: Replicate) -> tuple[Replicate, Result | Exception]:
+    """The result of a replicate, or what it raised: one that fails must not end the others."""
     import torch
 
-    torch.set_num_threads(1)  # the parallel processes share the cores
+    torch.set_num_threads(1)  # replicates that run at the same time share the cores
     start = time.perf_counter()
-    result = replicate.run()
+    try:
+        result = replicate.run()
+    except Exception as error:
+        error.add_note(f"Raised by {replicate.method}-{replicate.seed}.")
+        return replicate, error
     named = {"method": replicate.method, "seed": replicate.seed, **result}
-    write_json(replicate.path(folder), named | {"wall_seconds": time.perf_counter() - start} | provenance(argv))
-    return f"{replicate.method}-{replicate.seed}"
+    return replicate, named | {"wall_seconds": time.perf_counter() - start}
 
 
 def _command(argv: list[str]) -> list[str]:

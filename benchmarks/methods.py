@@ -1,60 +1,94 @@
-"""The methods that are compared, each through the face of a Stable-Baselines3 algorithm."""
+"""The methods that are compared, each an agent with the face of a Stable-Baselines3 algorithm.
+
+A method is one entry of :data:`METHODS`; every benchmark takes its agents from here.
+"""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 
 import famle_envs  # noqa: F401 (registers the robots)
-from benchmarks.harness import Result
-from famle_agent import FAMLE
+from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent, Transitions
+from famle_agent.envs import situation_envs
+from famle_agent.hyperparameters import known_robots
+from famle_agent.policies import make_held_uniform
+from famle_agent.transitions import collect
 from famle_envs import Situation
+from famle_envs.wrappers import RandomSituation
 
-__all__ = ["METHODS", "Task", "shipped"]
+__all__ = ["METHODS", "PPO_METHODS", "Method", "Task", "famle", "shipped"]
+
+SIDE_BY_SIDE = 30  # replicates whose networks are meta-trained as the members of one ensemble
 
 
 @dataclass(frozen=True)
 class Task:
-    """A robot that is broken from its first step on.
+    """The test robot of one replicate.
 
     Attributes:
         robot: The robot's name.
-        env_id: Its environment.
-        situation: What is wrong with it.
-        steps: Robot steps to run.
-        ppo_steps: Robot steps for PPO, which needs more.
-        cache: Folder for meta-trained agents, which the methods of one seed share.
+        seed: Of the robot and the planner, and of what the method learns for itself.
+        situation: What is wrong with the robot.
+        cache: Folder of the agents that are learnt in simulation, which replicates and methods share.
+        profile: What else differs from the simulator.
+        later: What goes wrong on the way, if anything does.
+        strikes_at: The action before which it does.
     """
 
     robot: str
-    env_id: str
+    seed: int
     situation: Situation
-    steps: int
-    ppo_steps: int
     cache: Path
+    profile: str = ""
+    later: Situation | None = None
+    strikes_at: int = 0
+
+    @property
+    def env_id(self) -> str:
+        """The Gymnasium id."""
+        return known_robots()[self.robot].env_id
+
+    def make(self) -> gym.Env[Any, Any]:
+        """The test robot."""
+        kwargs: dict[str, Any] = {"profile": self.profile} if self.profile else {}
+        return gym.make(self.env_id, situation=self.situation, **kwargs)
 
 
-def famle(task: Task, seed: int, mode: str = "ours", **overrides: Any) -> Result:
-    """FAMLE, meta-trained over the robot's training situations, adapting on the broken robot."""
-    agent = _meta_trained(task, seed, mode)
-    return _live(FAMLE.load(agent, device="cpu", **overrides), task, seed)
+@dataclass(frozen=True)
+class Method:
+    """How an agent comes to be.
+
+    Attributes:
+        agent: Makes the agent of a task, with all that it knows from simulation.
+        learn: Learns in simulation what the replicates share, into the cache; does nothing where that is there.
+    """
+
+    agent: Callable[[Task], BaseAlgorithm]
+    learn: Callable[[Task], object] = lambda task: None
 
 
-def oracle(task: Task, seed: int) -> Result:
-    """The upper line: a model of the very test situation, of as many transitions; it has nothing to adapt to."""
-    probe = FAMLE(task.robot, device="cpu")
-    situations = len(gym.make(task.env_id).get_wrapper_attr("training_situations"))
-    n = situations * probe.hyperparameters.transitions_per_situation
-    agent = FAMLE(task.robot, seed=seed, device="cpu", transitions_per_situation=n, adapt_every=0)
-    agent.meta_learn([task.situation])
-    return _live(agent, task, seed)
+# --- FAMLE ------------------------------------------------------------------------------------------------------------
+
+
+def famle(task: Task, **overrides: Any) -> FAMLE:
+    """FAMLE with the model that the package ships, or where it ships none a model of the replicate's own."""
+    if _is_shipped(task.robot):
+        return shipped(task.robot, task.seed, **overrides)
+    path = task.cache / f"{task.robot}-ours-{task.seed}.zip"
+    if not path.exists():
+        FAMLE(task.robot, seed=task.seed, device="cpu").meta_learn().save(path)
+    return FAMLE.load(path, device="cpu", **overrides)
 
 
 def shipped(robot: str, seed: int, **overrides: Any) -> FAMLE:
@@ -65,47 +99,181 @@ def shipped(robot: str, seed: int, **overrides: Any) -> FAMLE:
     return agent
 
 
-def ppo(task: Task, seed: int) -> Result:
-    """Stable-Baselines3's PPO from scratch on the broken robot."""
-    env = Monitor(gym.make(task.env_id, situation=task.situation))
-    start = time.perf_counter()
-    # 100 steps between updates instead of 2,048, or it would not learn at all in the steps the others need.
-    PPO("MlpPolicy", env, n_steps=100, batch_size=50, seed=seed, device="cpu").learn(task.ppo_steps)
-    return _result(env, time.perf_counter() - start)
+def oracle(task: Task) -> FAMLE:
+    """The upper line: a model of the very test robot, of as many random transitions as FAMLE's of all situations.
 
-
-METHODS: dict[str, Callable[[Task, int], Result]] = {
-    "famle": famle,
-    "famle-frozen": lambda task, seed: famle(task, seed, adapt_every=0),
-    "famle-select": lambda task, seed: famle(task, seed, adapt_steps=0),
-    "famle-paper": lambda task, seed: famle(task, seed, mode="paper"),
-    "oracle": oracle,
-    "ppo": ppo,
-}
-"""Method by name."""
-
-
-def _meta_trained(task: Task, seed: int, mode: str) -> Path:
-    """The agent of a seed, meta-trained once for all methods that start from it."""
-    path = task.cache / f"{task.robot}-{mode}-{seed}.zip"
+    Where the test robot has a profile, its model is of 2,000 of its gaits, and it adapts all the same.
+    """
+    broken = str(task.situation).replace(" ", "_")
+    path = task.cache / f"{task.robot}-oracle-{task.profile or task.seed}-{broken}.zip"
     if not path.exists():
-        FAMLE(task.robot, mode, seed=seed, device="cpu").meta_learn().save(path)
+        (_model_of_profile if task.profile else _model_of_situation)(task).save(path)
+    return FAMLE.load(path, device="cpu")
+
+
+def _model_of_situation(task: Task) -> FAMLE:
+    probe = FAMLE(task.robot, device="cpu", pretrained=False)
+    situations = len(probe._require_env().get_attr("training_situations")[0])
+    n = situations * probe.hyperparameters.transitions_per_situation
+    agent = FAMLE(task.robot, seed=task.seed, device="cpu", transitions_per_situation=n, adapt_every=0)
+    return agent.meta_learn([task.situation])
+
+
+def _model_of_profile(task: Task) -> FAMLE:
+    agent = FAMLE(task.robot, seed=0, device="cpu", pretrained=False, compose=False)
+    # Collected by hand: no agent meta-learns on a profile, and this one is not to be had on a real robot.
+    hold = make_held_uniform(agent.hyperparameters.action_hold)
+    return agent.meta_learn(collect([task.make], [task.situation.label], 2000, hold, seed=0))
+
+
+def one_simulator(task: Task) -> FAMLE:
+    """An agent that knows only the intact robot in its simulator, four times as long as FAMLE knows each situation."""
+    path = task.cache / f"{task.robot}-one-simulator.zip"
+    if not path.exists():
+        n = 4 * known_robots()[task.robot].hyperparameters("ours").transitions_per_situation
+        agent = FAMLE(task.robot, seed=0, device="cpu", pretrained=False, compose=False, transitions_per_situation=n)
+        agent.meta_learn(["intact"]).save(path)
+    return FAMLE.load(path, device="cpu", adapt_every=0)
+
+
+# --- agents that are meta-trained for the benchmark -------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MetaTrained:
+    """An agent whose meta-training the package does not ship.
+
+    Where FAMLE's is shipped, all replicates share one model, as they share that one. Else each of
+    :data:`SIDE_BY_SIDE` replicates has a network of its own, all of them trained on the same simulated data: they are
+    the members of one ensemble, which know nothing of each other, so that they cost little more than one would.
+
+    Attributes:
+        name: Of the file in the cache.
+        cls: The kind of agent.
+        mode: Of its settings.
+        settings: Settings to change.
+    """
+
+    name: str
+    cls: type[ModelBasedAgent]
+    mode: str = "ours"
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def agent(self, task: Task) -> ModelBasedAgent:
+        """The agent of a replicate."""
+        path = self.learn(task)
+        if _is_shipped(task.robot):
+            return self.cls.load(path, device="cpu")
+        many, one = self.cls.load(path, device="cpu"), self._new(task.robot, task.seed)
+        one.situations = many.situations
+        one.dynamics = many._require_dynamics().with_members(1, first=task.seed % SIDE_BY_SIDE)
+        return one
+
+    def learn(self, task: Task) -> Path:
+        """The file of the agents of all replicates, which is made where it is not there."""
+        path = task.cache / f"{task.robot}-{self.name}.zip"
+        if not path.exists():
+            members = {} if _is_shipped(task.robot) else {"members": SIDE_BY_SIDE}
+            data = _planned_data(task) if task.robot == "ant" and self.mode == "ours" else None
+            self._new(task.robot, seed=0, **members).meta_learn(data, progress_bar=True, n_jobs=-1).save(path)
+        return path
+
+    def _new(self, robot: str, seed: int, **more: Any) -> ModelBasedAgent:
+        return self.cls(robot, self.mode, seed=seed, device="cpu", pretrained=False, **{**self.settings, **more})
+
+
+def _planned_data(task: Task) -> Transitions:
+    """As many transitions as FAMLE's model has seen: random ones, and ones of planning with that very model.
+
+    FAMLE's own rounds begin with a poor model, which the rivals are spared.
+    """
+    path = task.cache / f"{task.robot}-transitions.npz"
+    if not path.exists():
+        agent = famle(task)
+        settings, env = agent.hyperparameters, agent._require_env()
+        sources = situation_envs(env, None)
+        random = collect(
+            sources.sources,
+            sources.situations,
+            settings.transitions_per_situation,
+            make_held_uniform(settings.action_hold),
+            seed=0,
+            n_jobs=-1,
+        )
+        n = settings.rounds * settings.round_transitions
+        planned = collect(sources.sources, sources.situations, n, agent._planning(), seed=1, n_jobs=-1)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        random.followed_by(planned).save(path)
+    return Transitions.load(path)
+
+
+# --- PPO --------------------------------------------------------------------------------------------------------------
+
+PPO_SETTINGS: Mapping[str, Mapping[str, Any]] = {
+    # 100 steps between updates instead of 2,048, or it would not learn at all in the steps the others need.
+    "reacher": {"n_steps": 100, "batch_size": 50},
+}
+"""What differs from Stable-Baselines3's own defaults, by robot."""
+
+PPO_SIMULATED = {"reacher": 500_000, "ant": 2_000_000}
+"""Simulated steps of the PPO that is trained over the training situations first; FAMLE has 22,000 and 300,000."""
+
+
+def ppo(task: Task) -> PPO:
+    """Stable-Baselines3's PPO, which learns on the broken robot from scratch."""
+    return PPO("MlpPolicy", Monitor(task.make()), seed=task.seed, device="cpu", **PPO_SETTINGS.get(task.robot, {}))
+
+
+def ppo_pretrained(task: Task) -> PPO:
+    """The same, first trained in simulation with a training situation drawn for each episode."""
+    scratch = ppo(task)
+    scratch.set_parameters(str(_learn_ppo(task)), device="cpu")
+    return scratch
+
+
+def _learn_ppo(task: Task) -> Path:
+    path = task.cache / f"{task.robot}-ppo.zip"
+    if not path.exists():
+        env = make_vec_env(lambda: RandomSituation(gym.make(task.env_id)), n_envs=8, seed=0)
+        agent = PPO("MlpPolicy", env, n_steps=256, batch_size=256, seed=0, device="cpu")
+        agent.learn(PPO_SIMULATED[task.robot], progress_bar=True)
+        partial_path = path.with_name(f"{path.stem}.{os.getpid()}.partial.zip")
+        agent.save(partial_path)
+        partial_path.replace(path)
+        env.close()
     return path
 
 
-def _live(agent: FAMLE, task: Task, seed: int) -> Result:
-    env = Monitor(gym.make(task.env_id, situation=task.situation))
-    agent.set_env(env)
-    agent.set_random_seed(seed)
-    start = time.perf_counter()
-    agent.learn(task.steps)
-    return _result(env, time.perf_counter() - start)
+# --- what they are called ---------------------------------------------------------------------------------------------
 
 
-def _result(env: Monitor[Any, Any], seconds: float) -> Result:
-    return {
-        "situation": str(env.get_wrapper_attr("situation")),
-        "returns": [round(value, 3) for value in env.get_episode_rewards()],
-        "lengths": env.get_episode_lengths(),
-        "seconds_per_step": seconds / max(1, env.get_total_steps()),
-    }
+def _meta_trained(name: str, cls: type[ModelBasedAgent], mode: str = "ours", **settings: Any) -> Method:
+    recipe = MetaTrained(name, cls, mode, settings)
+    return Method(recipe.agent, recipe.learn)
+
+
+METHODS: dict[str, Method] = {
+    "famle": Method(famle),
+    "famle-frozen": Method(partial(famle, adapt_every=0)),
+    "famle-select": Method(partial(famle, adapt_steps=0)),
+    "famle-likeliest": Method(partial(famle, spread_members=False)),
+    "famle-nearest": Method(partial(famle, adapt_steps=0, compose=False, spread_members=False)),
+    "famle-paper": _meta_trained("paper", FAMLE, "paper"),
+    "famle-original": _meta_trained("original", FAMLE, "original"),
+    "ampc": _meta_trained("ampc", AMPC),
+    "ampc-reptile": _meta_trained("reptile", AMPCMAML, meta_learner="reptile"),
+    "ampc-fomaml": _meta_trained("fomaml", AMPCMAML, meta_learner="first-order-maml"),
+    "ampc-maml": _meta_trained("maml", AMPCMAML, meta_learner="maml"),
+    "ppo": Method(ppo),
+    "ppo-pretrained": Method(ppo_pretrained, _learn_ppo),
+    "oracle": Method(oracle),
+    "one-simulator": Method(one_simulator, one_simulator),
+}
+"""Methods by name."""
+
+PPO_METHODS = ("ppo", "ppo-pretrained")
+"""Those that need many more steps than the others."""
+
+
+def _is_shipped(robot: str) -> bool:
+    return known_robots()[robot].pretrained is not None

@@ -9,8 +9,6 @@ Replicates share the shipped model, and the other agents theirs; each has its ow
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -18,41 +16,34 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.gait_robots import METHODS, Task, run
-from benchmarks.harness import Replicate, Result, check_methods, load_results, run_replicates
+from benchmarks.compare import compare
+from benchmarks.gait_robots import run
+from benchmarks.harness import Options, Result, load_results
+from benchmarks.methods import Task
 from benchmarks.report import by_method, quartiles
 from famle_agent.plots import plot_paths
 from famle_envs import Situation
 from famle_envs.minitaur import REALITY
 
+RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
 DEFAULT_METHODS = {
-    "reality": ("famle", "famle-frozen", "famle-nearest", "famle-likeliest", "one-simulator", "oracle"),
+    "reality": ("famle", "famle-frozen", "famle-nearest", "famle-likeliest", *RIVALS, "one-simulator", "oracle"),
     "home": ("famle", "one-simulator"),
 }
 
 
 @dataclass(frozen=True)
-class Args:
-    """Runs replicates that are not stored yet, then reports on all that are."""
+class Args(Options):
+    """The Minitaur in its reality: the paper's table II."""
 
     experiment: Literal["reality", "home"] = "reality"
     """Where the robot walks."""
-    methods: tuple[str, ...] = ()
-    """Entries of METHODS; by default those that belong to the experiment."""
-    replicates: int = 10
-    """Seeds 0, 1, ..."""
-    jobs: int = 2
-    """Parallel processes."""
-    out: Path = Path("benchmarks/results")
-    """Folder of the results."""
-    cache: Path = Path("runs/agents")
-    """Folder of the agents that are trained here."""
 
 
 def task_of(experiment: str, seed: int, args: Args) -> Task:
     """The test robot of a replicate; intact, but for its profile."""
     profile = "simulator" if experiment == "home" else REALITY.name
-    return Task("minitaur", seed, Situation(), profile, args.cache)
+    return Task("minitaur", seed, Situation(), args.cache, profile)
 
 
 def summary(results: list[Result], experiment: str) -> Table:
@@ -76,10 +67,7 @@ def main(args: Args) -> None:
     """Runs and reports."""
     folder = args.out / f"minitaur-{args.experiment}"
     methods = args.methods or DEFAULT_METHODS[args.experiment]
-    check_methods(methods, METHODS)
-    for method in methods:
-        tasks = [task_of(args.experiment, seed, args) for seed in range(args.replicates)]
-        run_replicates([Replicate(method, task.seed, partial(run, method, task)) for task in tasks], folder, args.jobs)
+    compare(methods, [task_of(args.experiment, seed, args) for seed in range(args.replicates)], run, folder, args)
     results = load_results(folder)
     Console(width=120).print(summary(results, args.experiment))
     first = {result["method"]: np.array(result["path"]) for result in results if result["seed"] == 0}

@@ -10,17 +10,17 @@ legs take turns.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.gait_robots import METHODS, Task, run
-from benchmarks.harness import Replicate, Result, check_methods, load_results, run_replicates
+from benchmarks.compare import compare
+from benchmarks.gait_robots import run
+from benchmarks.harness import Options, Result, load_results
+from benchmarks.methods import Task
 from benchmarks.report import by_method
 from famle_agent.plots import plot_paths
 from famle_envs import Situation
@@ -28,30 +28,23 @@ from famle_envs.quadruped import LEGS, REALITY, blocked_leg
 
 YAW = math.radians(30)
 PAPER = {"yaw": "32.6 +- 2.3", "leg": "43.1 +- 6.4", "both": "41.6 +- 7.7"}
+RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
 PARTS = ("famle", "famle-frozen", "famle-nearest", "famle-likeliest")
 DEFAULT_METHODS = {
-    "later": PARTS,
+    "later": (*PARTS, *RIVALS),
     "gap-home": ("one-simulator", "famle"),
     "gap-reality": ("one-simulator", "famle"),
 }
 
 
 @dataclass(frozen=True)
-class Args:
-    """Runs replicates that are not stored yet, then reports on all that are."""
+class Args(Options):
+    """The quadruped in its reality: the paper's table I."""
 
     experiments: tuple[str, ...] = ("yaw", "leg", "both", "later")
     """Some of yaw, leg, both, later, and gap-home, gap-reality for the intact robot in both."""
-    methods: tuple[str, ...] = ()
-    """Entries of METHODS; by default those that belong to the experiment."""
     replicates: int = 12
     """Seeds 0, 1, ..."""
-    jobs: int = 2
-    """Parallel processes."""
-    out: Path = Path("benchmarks/results")
-    """Folder of the results."""
-    cache: Path = Path("runs/agents")
-    """Folder of the agents that are trained here."""
 
 
 def task_of(experiment: str, seed: int, args: Args) -> Task:
@@ -63,8 +56,8 @@ def task_of(experiment: str, seed: int, args: Args) -> Task:
         "both": Situation(locked_joints=leg.locked_joints, orientation_error=YAW),
     }
     profile = "simulator" if experiment == "gap-home" else REALITY.name
-    task = partial(Task, "quadruped", seed, wrong.get(experiment, Situation()), profile, args.cache)
-    return task(later=wrong["yaw"], strikes_at=5) if experiment == "later" else task()
+    task = Task("quadruped", seed, wrong.get(experiment, Situation()), args.cache, profile)
+    return replace(task, later=wrong["yaw"], strikes_at=5) if experiment == "later" else task
 
 
 def summary(results: list[Result], experiment: str) -> Table:
@@ -87,13 +80,9 @@ def summary(results: list[Result], experiment: str) -> Table:
 def main(args: Args) -> None:
     """Runs and reports."""
     for experiment in args.experiments:
-        methods = args.methods or DEFAULT_METHODS.get(experiment, (*PARTS, "oracle"))
-        check_methods(methods, METHODS)
+        methods = args.methods or DEFAULT_METHODS.get(experiment, (*PARTS, *RIVALS, "oracle"))
         folder = args.out / f"quadruped-{experiment}"
-        for method in methods:
-            tasks = [task_of(experiment, seed, args) for seed in range(args.replicates)]
-            replicates = [Replicate(method, task.seed, partial(run, method, task)) for task in tasks]
-            run_replicates(replicates, folder, args.jobs)
+        compare(methods, [task_of(experiment, seed, args) for seed in range(args.replicates)], run, folder, args)
         results = load_results(folder)
         Console(width=120).print(summary(results, experiment))
         first = {result["method"]: np.array(result["path"]) for result in results if result["seed"] == 0}

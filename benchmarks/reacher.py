@@ -8,43 +8,38 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import tyro
 from rich.console import Console
 
-from benchmarks.harness import Replicate, Result, load_results, run_replicates
-from benchmarks.methods import METHODS, Task
+from benchmarks import curves
+from benchmarks.compare import compare
+from benchmarks.harness import Options, Result, load_results
+from benchmarks.methods import METHODS, PPO_METHODS, Task
 from benchmarks.report import plot_curves, summary
 from famle_envs import Situation
 from famle_envs.reacher import ReacherEnv
 
 SOLVED = 30.0
-ENV_ID = "FamleReacher-v0"
+
+
+MODEL_BASED = ("famle", "famle-paper", "famle-original", "ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
 
 
 @dataclass(frozen=True)
-class Args:
-    """Runs replicates that are not stored yet, then reports on all that are."""
+class Args(Options):
+    """The arm: the paper's figure 3, and the same over damages drawn at random."""
 
     damage: Literal["paper", "random"] = "paper"
     """The paper's (-1, 1, 1, 0, 1), or two faults drawn anew for each replicate."""
-    methods: tuple[str, ...] = ("famle", "famle-frozen", "oracle", "ppo")
-    """Entries of benchmarks.methods.METHODS."""
-    replicates: int = 10
-    """Seeds; each has its own data, meta-training and robot."""
+    replicates: int = 30
+    """Seeds 0, 1, ..."""
     steps: int = 1000
     """Robot steps of the model-based methods."""
     ppo_steps: int = 20_000
     """Robot steps of PPO."""
-    jobs: int = 2
-    """Parallel processes."""
-    out: Path = Path("benchmarks/results")
-    """Folder of the results."""
-    cache: Path = Path("runs/agents")
-    """Folder of the meta-trained agents."""
 
 
 def situation_of(damage: str, seed: int) -> Situation:
@@ -54,22 +49,18 @@ def situation_of(damage: str, seed: int) -> Situation:
     return ReacherEnv.sample_situation(np.random.default_rng([2020, seed]), n_faults=2)
 
 
-def run(method: str, seed: int, args: Args) -> Result:
+def run(method: str, task: Task, args: Args) -> Result:
     """One replicate."""
-    situation = situation_of(args.damage, seed)
-    return METHODS[method](Task("reacher", ENV_ID, situation, args.steps, args.ppo_steps, args.cache), seed)
+    steps = args.ppo_steps if method in PPO_METHODS else args.steps
+    return curves.run(METHODS[method].agent(task), task, steps)
 
 
 def main(args: Args) -> None:
     """Runs and reports."""
-    for method in args.methods:
-        if method not in METHODS:
-            raise ValueError(f"There is no method {method!r}. Methods: {', '.join(METHODS)}.")
+    methods = args.methods or (*MODEL_BASED, *PPO_METHODS, "famle-frozen", "oracle")
+    tasks = [Task("reacher", seed, situation_of(args.damage, seed), args.cache) for seed in range(args.replicates)]
     folder = args.out / f"reacher-{args.damage}"
-    # One method after the other: the first leaves the meta-trained agents that the next ones start from.
-    for method in args.methods:
-        seeds = range(args.replicates)
-        run_replicates([Replicate(method, seed, partial(run, method, seed, args)) for seed in seeds], folder, args.jobs)
+    compare(methods, tasks, partial(run, args=args), folder, args)
     results = load_results(folder)
     title = f"Reacher, {args.damage} damage"
     Console(width=160).print(summary(results, SOLVED, title, within=200))

@@ -7,8 +7,9 @@ h_i + h_j - h_0 is the situation with both faults, if h_0 is the intact robot.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -20,10 +21,15 @@ __all__ = [
     "Belief",
     "Candidates",
     "Memory",
+    "Sample",
     "adapt",
+    "descend",
     "filtered_posterior",
+    "minibatches",
     "prior",
+    "select",
     "systematic_sample",
+    "whole_memory",
     "window_posterior",
 ]
 
@@ -59,6 +65,19 @@ class Memory:
         )
         return cls(obs, action, obs, log_p, torch.zeros(robots, size, device=device))
 
+    @property
+    def seen(self) -> int:
+        """Transitions of the robot that has most of them."""
+        return int(self.weight.sum(dim=1).max())
+
+    def range(self) -> tuple[Tensor, Tensor]:
+        """Least and largest value of each observed number, (B, obs_dim); infinite for a robot that has seen nothing."""
+        empty = self.weight[..., None] == 0.0
+        low = torch.minimum(self.obs, self.next_obs).masked_fill(empty, math.inf).amin(dim=1)
+        high = torch.maximum(self.obs, self.next_obs).masked_fill(empty, -math.inf).amax(dim=1)
+        nothing = low > high
+        return low.masked_fill(nothing, -math.inf), high.masked_fill(nothing, math.inf)
+
     def resized(self, size: int) -> Memory:
         """The newest ``size`` places, with empty ones in front where there are fewer."""
 
@@ -82,6 +101,29 @@ class Memory:
             push(self.log_p, log_p),
             push(self.weight, torch.ones_like(valid, dtype=obs.dtype)),
         )
+
+
+Sample = Callable[[Batch], Batch]
+"""Chooses the transitions of a gradient step."""
+
+
+def whole_memory(data: Batch) -> Batch:
+    """All transitions in each step, as in the paper."""
+    return data
+
+
+def minibatches(size: int, generator: torch.Generator) -> Sample:
+    """Transitions drawn anew for each step, ``size`` of each row, with repetitions."""
+
+    def sample(data: Batch) -> Batch:
+        chance = torch.rand(len(data.weight), size, generator=generator, device=generator.device)
+        nth = (chance.to(data.weight.device) * data.weight.sum(dim=1, keepdim=True)).floor()
+        # Of the transitions that count, the nth is where their running number passes n.
+        i = torch.searchsorted(data.weight.cumsum(dim=1), nth, right=True).clamp(max=data.weight.shape[1] - 1)
+        rows = torch.arange(len(i), device=i.device)[:, None]
+        return Batch(data.x[rows, i], data.y[rows, i], data.weight[rows, i])
+
+    return sample
 
 
 @dataclass(frozen=True)
@@ -233,7 +275,6 @@ def systematic_sample(posterior: Tensor, n: int, offset: float) -> Tensor:
     return order.gather(1, index.clamp(max=posterior.shape[1] - 1))
 
 
-@torch.no_grad()
 def adapt(
     model: Dynamics,
     candidates: Candidates,
@@ -242,6 +283,7 @@ def adapt(
     belief: Belief,
     validation_size: int = 0,
     spread: bool = False,
+    sample: Sample = whole_memory,
 ) -> Belief:
     """Lines 6 and 7 of Algorithm 2 for B robots at once.
 
@@ -251,30 +293,59 @@ def adapt(
         memory: D_M.
         inner_loop: k steps of gradient descent; where they diverge, theta_meta and the embedding stay.
         belief: Its posterior counts; theta* and h* are found anew.
-        validation_size: The newest transitions, which no gradient step sees. Steps that do not make them more likely
-            are taken back, in each member of the ensemble by itself; 0 trusts all steps, as the paper does.
+        validation_size: As for :func:`descend`.
+        spread: As for :func:`select`.
+        sample: As for :func:`descend`.
+    """
+    return descend(model, select(model, candidates, belief, spread), memory, inner_loop, validation_size, sample)
+
+
+def select(model: Dynamics, candidates: Candidates, belief: Belief, spread: bool = False) -> Belief:
+    """Line 6: theta_meta with the most likely embedding, h_likely = argmax log p(D_M | theta_meta, h).
+
+    Args:
+        model: Holds theta_meta.
+        candidates: The embeddings to select from.
+        belief: Its posterior counts.
         spread: Whether the members of the ensemble begin with candidates that are sampled from the posterior, others
             each time, instead of all with the most likely one. A plan has to be good then in several situations that
             may be the case, and a robot that is stuck tries what it would do in another one.
     """
-    robots, members = len(memory.weight), model.members
-
-    # h_likely = argmax log p(D_M | theta_meta, h) over the candidates (line 6).
-    log_posterior = belief.log_posterior
-    likely = log_posterior.argmax(dim=1, keepdim=True).expand(-1, members)
+    robots, members = len(belief.log_posterior), model.members
+    likely = belief.log_posterior.argmax(dim=1, keepdim=True).expand(-1, members)
     if spread:
         likely = systematic_sample(belief.posterior, members, offset=belief.adaptations * _GOLDEN_RATIO % 1.0)
     h_likely = candidates.h[torch.arange(members, device=likely.device), likely].flatten(0, 1)
-
-    # theta*, h* = k steps from theta_meta, h_likely (line 7), each member of the ensemble by itself.
     theta_meta = expand(model.parameters_by_name(), robots)
-    start = Belief(theta_meta, h_likely, log_posterior, belief.adaptations + 1)
+    return Belief(theta_meta, h_likely, belief.log_posterior, belief.adaptations + 1)
+
+
+@torch.no_grad()
+def descend(
+    model: Dynamics,
+    start: Belief,
+    memory: Memory,
+    inner_loop: InnerLoop,
+    validation_size: int = 0,
+    sample: Sample = whole_memory,
+) -> Belief:
+    """Line 7: theta*, h* = k gradient steps from where a belief is, each member of the ensemble by itself.
+
+    Args:
+        model: Says what the parameters mean.
+        start: Its theta and h are where the steps begin, and stay where they diverge.
+        memory: D_M.
+        inner_loop: The k steps.
+        validation_size: The newest transitions, which no gradient step sees. Steps that do not make them more likely
+            are taken back, in each member of the ensemble by itself; 0 trusts all steps, as the paper does.
+        sample: Chooses the transitions of each step among those it may see.
+    """
     if inner_loop.steps == 0:
         return start
     data = model.encode(memory.obs, memory.action, memory.next_obs, memory.weight)
-    data = Batch(*(values.repeat_interleave(members, dim=0) for values in (data.x, data.y, data.weight)))
+    data = Batch(*(values.repeat_interleave(model.members, dim=0) for values in (data.x, data.y, data.weight)))
     seen, newest = _split(data, validation_size)
-    theta, h, _ = inner_loop(model, start.theta, start.h, lambda: seen)
+    theta, h, _ = inner_loop(model, start.theta, start.h, partial(sample, seen))
     if validation_size:
         better = model.loss(theta, h, newest) < model.loss(start.theta, start.h, newest)
         theta = {name: _choose(better, value, start.theta[name]) for name, value in theta.items()}

@@ -16,11 +16,11 @@ from stable_baselines3.common.utils import safe_mean
 from torch import Tensor
 from typing_extensions import Self
 
-from famle_agent.adaptation import Belief, Memory
+from famle_agent.adaptation import Belief, Memory, Sample, minibatches, whole_memory
 from famle_agent.checkpoint import File, load_agent, load_pretrained, restore_agent, save_agent
 from famle_agent.dashboard import log_posterior
 from famle_agent.online import OnlineLoop, OnlineState
-from famle_agent.planning import Planner, RewardFn
+from famle_agent.planning import Model, Planner, RewardFn, bounded
 from famle_agent.simulation import SimulationLearner
 from famle_agent.units import check_action, check_observation
 
@@ -239,13 +239,27 @@ class ModelBasedAgent(SimulationLearner):
             log_likelihood=self._log_likelihood,
             infer=self._infer,
             adapt=self._adapt,
-            simulator=lambda belief: model.simulator(belief.theta, belief.h),
+            simulator=self._simulator,
             reward_fn=self._unit_reward_fn(),
             planner=self.planner,
             members=model.members,
             adapt_every=self.hyperparameters.adapt_every,
+            adapt_at_reset=self.hyperparameters.adapt_at_reset,
             forget_at_reset=self.hyperparameters.forget_at_reset,
         )
+
+    def _simulator(self, belief: Belief, memory: Memory) -> Model:
+        model = self._require_dynamics()
+        simulator = model.simulator(belief.theta, belief.h)
+        if not self.hyperparameters.clamp_predictions or belief.adaptations == 0:
+            return simulator
+        low, high = (bound.repeat_interleave(model.members, dim=0) for bound in memory.range())
+        return bounded(simulator, low, high)
+
+    def _sample(self) -> Sample:
+        """What a gradient step on the robot sees."""
+        size = self.hyperparameters.adapt_batch_size
+        return minibatches(size, self._generator) if size else whole_memory
 
     def _state_of(self, robots: int) -> OnlineState:
         """What the agent believes now where that fits the number of robots, else what it meta-learned."""

@@ -72,7 +72,7 @@ class Dynamics(nn.Module):
     Args:
         obs_dim: Number of observation dimensions.
         action_dim: Number of action dimensions.
-        n_situations: Number of embeddings N.
+        n_situations: Number of embeddings N; 1 is a model that does not tell situations apart.
         embedding_dim: Size of an embedding.
         hidden: Width of each hidden layer.
         angle_dims: Observation dimensions that are angles in rad.
@@ -154,24 +154,29 @@ class Dynamics(nn.Module):
         """Theta as plain tensors without gradient, (P, ...)."""
         return {name: value.detach() for name, value in self.theta.items()}
 
-    def with_members(self, count: int) -> Dynamics:
-        """A model of the first ``count`` members.
+    def with_members(self, count: int, first: int = 0) -> Dynamics:
+        """A model of ``count`` of the members, from the one of index ``first`` on.
 
         Raises:
             ValueError: There are not as many.
         """
-        if not 1 <= count <= self.members:
-            raise ValueError(f"The ensemble has 1 to {self.members} members to give, not {count}.")
+        if not (1 <= count <= self.members and 0 <= first <= self.members - count):
+            raise ValueError(f"The ensemble has 1 to {self.members} members to give, not {count} from {first} on.")
+        chosen = slice(first, first + count)
         part = copy.deepcopy(self)
         for owner, names in ((part.theta, list(self.theta)), (part, ["embeddings"])):
             for name in names:
-                setattr(owner, name, nn.Parameter(getattr(owner, name).detach()[:count].clone()))
-        part.noise_std = self.noise_std[:count].clone()
+                setattr(owner, name, nn.Parameter(getattr(owner, name).detach()[chosen].clone()))
+        part.noise_std = self.noise_std[chosen].clone()
         return part
+
+    def embedding_index(self, c: Tensor) -> Tensor:
+        """Which embeddings belong to situations c: a model with a single one has it for all of them."""
+        return c if self.n_situations > 1 else torch.zeros_like(c)
 
     def embeddings_of(self, c: Tensor) -> Tensor:
         """The embeddings of situations c (B,) in every member, (B * P, embedding_dim)."""
-        return self.embeddings.detach()[:, c].transpose(0, 1).flatten(0, 1)
+        return self.embeddings.detach()[:, self.embedding_index(c)].transpose(0, 1).flatten(0, 1)
 
     # --- data -------------------------------------------------------------------------------------------
 
@@ -283,7 +288,7 @@ class Dynamics(nn.Module):
         nu, stride = self.degrees_of_freedom, -(-batch.weight.numel() // _NOISE_SAMPLES)
         x, y, weight = (values[:, ::stride] for values in (batch.x, batch.y, batch.weight))
         rows = x.shape[1]
-        h = self.embeddings.repeat_interleave(rows, dim=1)  # (P, N * rows, embedding_dim)
+        h = self.embeddings.expand(-1, len(x), -1).repeat_interleave(rows, dim=1)  # (P, N * rows, embedding_dim)
         x = x.flatten(0, 1).expand(self.members, -1, -1)
         squared = (self.predict(self.parameters_by_name(), h, x) - y.flatten(0, 1)).square()
         weight = weight.reshape(1, -1, 1)

@@ -16,7 +16,6 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from famle_agent.hyperparameters import known_robots
 from famle_agent.planning import RewardFn
-from famle_agent.policies import REWARDS
 from famle_agent.transitions import EnvSource
 from famle_envs.reality import Profile
 from famle_envs.situation import Situation
@@ -192,9 +191,9 @@ def _check_simulated(made: gym.Env[Any, Any]) -> None:
         )
 
 
-def planning_reward(env: VecEnv) -> RewardFn | None:
-    """What a planner should maximise in an environment, where it says that."""
-    known: list[RewardFn] = [env_attribute(env, name, None) for name in REWARDS if env.has_attr(name)]
+def planning_reward(env: VecEnv, names: Sequence[str]) -> RewardFn | None:
+    """What a planner should maximise in an environment, where it says that; the first of the names that it has."""
+    known: list[RewardFn] = [env_attribute(env, name, None) for name in names if env.has_attr(name)]
     return known[0] if known else None
 
 

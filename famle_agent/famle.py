@@ -33,17 +33,15 @@ class FAMLE(ModelBasedAgent):
 
     _known: tuple[tuple[Tensor, int, bool], Candidates] | None = None
 
+    @property
+    def _n_embeddings(self) -> int:
+        return len(self.situations)
+
     def _learn_model(
         self, transitions: Transitions, round_: int, last: bool, on_iteration: Callable[[dict[str, float]], bool]
     ) -> None:
         """Joint training in each round, and in the last one Algorithm 1: Reptile on theta and H."""
-        settings = self.hyperparameters
-        obs, action, next_obs = self._tensors(transitions.obs, transitions.action, transitions.next_obs)
-        if round_ == 0:
-            self.dynamics = self._new_dynamics(n_situations=len(transitions.situations))
-            self.dynamics.fit_normalisation(obs, next_obs)
-        model = self._require_dynamics()
-        data = model.encode(obs, action, next_obs)
+        settings, (model, data) = self.hyperparameters, self._begin_model(transitions, round_)
 
         def log(step: MetaStep) -> bool:
             return on_iteration({"meta/loss_before": step.loss_before, "meta/loss_after": step.loss_after})
@@ -100,8 +98,9 @@ class FAMLE(ModelBasedAgent):
             self._require_dynamics(),
             self._candidates(),
             memory,
-            settings.adaptation(),
+            settings.adaptation(memory.seen),
             belief,
             settings.validation_size,
             settings.spread_members,
+            self._sample(),
         )

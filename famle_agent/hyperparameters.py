@@ -13,6 +13,7 @@ import yaml
 
 from famle_agent.inner_loop import InnerLoop
 from famle_agent.joint_training import JointTraining
+from famle_agent.maml import MAML
 from famle_agent.meta_learning import Reptile
 from famle_agent.planning import ICEM, MPPI, Planner, RandomShooting
 
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from importlib.resources.abc import Traversable
 
 __all__ = ["Hyperparameters", "Robot", "known_robots", "robot_of"]
-
-Mode = Literal["ours", "paper"]
 
 
 @dataclass(frozen=True)
@@ -47,13 +46,16 @@ class Hyperparameters:
         joint_lr: Rate of theta in joint training.
         joint_embedding_lr: Rate of H in joint training.
         joint_batch_size: Transitions per step of joint training and member of the ensemble.
+        meta_learner: ``"reptile"``, which is FAMLE's, or for the rivals without embeddings ``"first-order-maml"`` or
+            ``"maml"``.
+        query_size: Transitions by which MAML judges the inner steps.
         inner_optimizer: Optimiser of the inner loop, ``"sgd"`` (the paper's) or ``"adam"``.
         inner_steps: k of meta-learning.
         inner_lr: alpha, rate of theta in the inner loop.
         embedding_lr: beta, rate of h in the inner loop.
         batch_size: Transitions per inner step of meta-learning.
-        meta_iterations: Iterations of Algorithm 1; 0 leaves it at the joint training.
-        meta_lr: alpha_meta.
+        meta_iterations: Iterations of Algorithm 1, or of MAML; 0 leaves it at the joint training.
+        meta_lr: alpha_meta; of MAML, the rate of the outer Adam.
         embedding_meta_lr: beta_meta.
         meta_batch_size: Situations per iteration of Algorithm 1; the paper's is 1.
         compose: Whether the most likely embedding is looked for among the sums of two training situations too, which
@@ -62,9 +64,16 @@ class Hyperparameters:
             other, so that one strange moment does not overturn what many have shown. The paper's is 1.
         hazard: Probability per step that the robot breaks (or is repaired), for a posterior that is filtered over all
             transitions; 0 takes the likelihood of the last M, as the paper does.
-        adapt_every: K, robot steps between two adaptations; 0 never adapts.
+        adapt_every: K, robot steps between two adaptations; 0 never adapts while an episode lasts.
+        adapt_at_reset: Whether to adapt when an episode ends.
         memory_size: M, transitions that adaptation looks back on.
+        adapt_optimizer: Optimiser of online adaptation; None takes ``inner_optimizer``.
         adapt_steps: k of online adaptation; None takes ``inner_steps``, 0 only selects an embedding.
+        adapt_epochs: Passes through the memory instead of ``adapt_steps``; 0 counts steps.
+        adapt_batch_size: Transitions per step of online adaptation, drawn from the memory; 0 takes all, as the paper
+            does.
+        keep_adapting: Whether an agent without embeddings takes its gradient steps from the network that it has,
+            instead of from the meta-learned one each time (the paper's).
         adapt_lr: alpha of online adaptation; None takes ``inner_lr``.
         adapt_embedding_lr: beta of online adaptation; None takes ``embedding_lr``.
         validation_size: The newest transitions of the memory, which gradient steps do not see and which decide whether
@@ -72,6 +81,9 @@ class Hyperparameters:
         spread_members: Whether the members of the ensemble start from situations that are sampled from the posterior,
             instead of all from the most likely one (the paper's).
         forget_at_reset: Whether a new episode empties the memory; damage outlasts an episode, so not by default.
+        clamp_predictions: Whether a plan may imagine no observation beyond the range of those in the memory.
+        planning_reward: Name of the environment's function that the planner maximises; empty takes its
+            ``planning_reward_fn`` or ``reward_fn``.
         planner: ``"icem"``, ``"mppi"`` or ``"random_shooting"`` (the paper's).
         horizon: H, steps that the planner looks ahead.
         candidates: Sequences judged per iteration of the planner.
@@ -101,6 +113,8 @@ class Hyperparameters:
     joint_lr: float = 1e-3
     joint_embedding_lr: float = 5e-3
     joint_batch_size: int = 512
+    meta_learner: Literal["reptile", "first-order-maml", "maml"] = "reptile"
+    query_size: int = 64
     inner_optimizer: Literal["sgd", "adam"] = "adam"
     inner_steps: int = 20
     inner_lr: float = 1e-3
@@ -114,13 +128,20 @@ class Hyperparameters:
     likelihood_power: float = 1.0
     hazard: float = 0.0
     adapt_every: int = 5
+    adapt_at_reset: bool = False
     memory_size: int = 50
+    adapt_optimizer: Literal["sgd", "adam"] | None = None
     adapt_steps: int | None = None
+    adapt_epochs: int = 0
+    adapt_batch_size: int = 0
+    keep_adapting: bool = False
     adapt_lr: float | None = None
     adapt_embedding_lr: float | None = None
     validation_size: int = 0
     spread_members: bool = False
     forget_at_reset: bool = False
+    clamp_predictions: bool = False
+    planning_reward: str = ""
     planner: Literal["icem", "mppi", "random_shooting"] = "icem"
     horizon: int = 10
     candidates: int = 100
@@ -140,9 +161,11 @@ class Hyperparameters:
             raise ValueError(f"hazard is a probability below 1, got {self.hazard!r}.")
         if not self.hidden or min(self.hidden) < 1:
             raise ValueError(f"hidden must name the width of at least one layer, got {self.hidden}.")
+        if self.adapt_epochs and not self.adapt_batch_size:
+            raise ValueError("adapt_epochs needs an adapt_batch_size; adapt_steps counts steps on the whole memory.")
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
-                raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}.")
+                raise ValueError(f"{name} must be one of {', '.join(map(str, choices))}, got {getattr(self, name)!r}.")
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Hyperparameters:
@@ -188,17 +211,22 @@ class Hyperparameters:
         """U^k of meta-learning."""
         return InnerLoop(self.inner_steps, self.inner_lr, self.embedding_lr, self.inner_optimizer)
 
-    def adaptation(self) -> InnerLoop:
-        """U^k on the robot: the rule of meta-learning but where it was said otherwise."""
+    def adaptation(self, seen: int) -> InnerLoop:
+        """U^k on the robot: the rule of meta-learning but where it was said otherwise.
+
+        Args:
+            seen: Transitions in the memory, for ``adapt_epochs``.
+        """
 
         def own(value: Any, inherited: Any) -> Any:
             return inherited if value is None else value
 
+        steps = own(self.adapt_steps, self.inner_steps)
         return InnerLoop(
-            own(self.adapt_steps, self.inner_steps),
+            self.adapt_epochs * -(-seen // self.adapt_batch_size) if self.adapt_epochs else steps,
             own(self.adapt_lr, self.inner_lr),
             own(self.adapt_embedding_lr, self.embedding_lr),
-            self.inner_optimizer,
+            own(self.adapt_optimizer, self.inner_optimizer),
         )
 
     def reptile(self) -> Reptile:
@@ -206,6 +234,12 @@ class Hyperparameters:
         return Reptile(
             self.meta_iterations, self.meta_lr, self.embedding_meta_lr, self.meta_batch_size, self.batch_size
         )
+
+    def maml(self) -> MAML:
+        """The meta-learner of a model without embeddings."""
+        first_order = self.meta_learner == "first-order-maml"
+        sizes = self.meta_batch_size, self.batch_size, self.query_size
+        return MAML(self.meta_iterations, self.meta_lr, *sizes, first_order=first_order)
 
     def make_planner(self) -> Planner:
         """The model-predictive controller."""
@@ -218,36 +252,43 @@ class Hyperparameters:
 
 
 _ONLINE = {
-    *("compose", "likelihood_power", "hazard", "adapt_every", "memory_size", "forget_at_reset"),
-    *("adapt_steps", "adapt_lr", "adapt_embedding_lr", "validation_size", "spread_members"),
+    *("compose", "likelihood_power", "hazard", "adapt_every", "adapt_at_reset", "memory_size", "forget_at_reset"),
+    *("adapt_optimizer", "adapt_steps", "adapt_epochs", "adapt_batch_size", "adapt_lr", "adapt_embedding_lr"),
+    "keep_adapting",
+    *("validation_size", "spread_members", "clamp_predictions", "planning_reward"),
     *("planner", "horizon", "candidates", "planner_iterations", "elites", "init_std", "noise_beta", "temperature"),
 }
 """Settings of the life on a robot; rounds in simulation plan too, but a model may be used with another planner."""
 _AT_LEAST_ONE = {
     *("transitions_per_situation", "action_hold", "round_transitions", "embedding_dim", "members", "joint_batch_size"),
-    *("inner_steps", "batch_size", "meta_batch_size", "memory_size"),
+    *("inner_steps", "batch_size", "query_size", "meta_batch_size", "memory_size"),
     *("horizon", "candidates", "planner_iterations", "elites"),
 }
 """The other numbers may be 0."""
 _CHOICES = {
+    "meta_learner": ("reptile", "first-order-maml", "maml"),
     "inner_optimizer": ("sgd", "adam"),
+    "adapt_optimizer": (None, "sgd", "adam"),
     "planner": ("icem", "mppi", "random_shooting"),
 }
 
 
 @dataclass(frozen=True)
 class Robot:
-    """An entry of ``hyperparams/``: a robot, its environment and its settings in both modes.
+    """An entry of ``hyperparams/``: a robot, its environment and its settings in all modes.
 
     Attributes:
         name: Its short name.
         env_id: The Gymnasium id; empty for the settings of an unknown environment.
-        modes: Settings by mode: ``paper`` is the paper's text, ``ours`` what we found to be best.
+        modes: Settings by mode: ``paper`` is the paper's text, ``original`` the authors' public code, ``ours`` what we
+            found to be best.
+        rivals: What the agents without embeddings change of ``ours``, by the name of the method; tuned for them.
     """
 
     name: str
     env_id: str
     modes: dict[str, dict[str, Any]]
+    rivals: dict[str, dict[str, Any]]
 
     @property
     def pretrained(self) -> Traversable | None:
@@ -255,8 +296,13 @@ class Robot:
         file = files("famle_agent").joinpath("pretrained", f"{self.name}.zip")
         return file if file.is_file() else None
 
-    def hyperparameters(self, mode: str, **overrides: Any) -> Hyperparameters:
+    def hyperparameters(self, mode: str, rival: str = "", **overrides: Any) -> Hyperparameters:
         """The settings of a mode with some changed.
+
+        Args:
+            mode: The mode.
+            rival: The method, where it is not FAMLE.
+            **overrides: Settings to change.
 
         Raises:
             TypeError: An override is no setting, or of the wrong type.
@@ -264,7 +310,8 @@ class Robot:
         """
         if mode not in self.modes:
             raise ValueError(f"mode must be one of {', '.join(self.modes)}, got {mode!r}.")
-        return Hyperparameters.from_dict({**self.modes[mode], **overrides})
+        tuned = self.rivals.get(rival, {}) if mode == "ours" else {}
+        return Hyperparameters.from_dict({**self.modes[mode], **tuned, **overrides})
 
 
 @cache
@@ -275,7 +322,7 @@ def known_robots() -> dict[str, Robot]:
         if file.name.endswith(".yaml"):
             entry = yaml.safe_load(file.read_text())
             name = file.name.removesuffix(".yaml")
-            robots[name] = Robot(name, entry.pop("env_id"), entry)
+            robots[name] = Robot(name, entry.pop("env_id"), rivals=entry.pop("rivals", {}), modes=entry)
     return robots
 
 

@@ -63,7 +63,7 @@ class JointTraining:
         theta, member = dict(model.theta.items()), torch.arange(model.members, device=data.x.device)[:, None]
         for _ in range(self.iterations):
             c, batch = self._sample(data, model.members, generator)
-            loss = model.loss(theta, model.embeddings[member, c], batch)
+            loss = model.loss(theta, model.embeddings[member, model.embedding_index(c)], batch)
             optimizer.zero_grad()
             loss.sum().backward()  # type: ignore[no-untyped-call]
             optimizer.step()

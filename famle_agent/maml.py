@@ -6,6 +6,7 @@ has to come from the k gradient steps.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -30,7 +31,7 @@ class MAML:
         batch_size: Transitions the inner steps see, the same ones in each step, as after the deployment.
         query_size: Other transitions of the same situation, which judge the adapted parameters.
         first_order: Whether the inner steps count as a constant shift of theta (eq. 5 instead of eq. 4).
-        max_grad_norm: The outer gradient is shortened to this length.
+        max_grad_norm: The outer gradient of each member of the ensemble is shortened to this length.
     """
 
     iterations: int
@@ -62,31 +63,33 @@ class MAML:
                 the other data after them; returning False ends meta-learning.
 
         Raises:
-            ValueError: If the model, the data or the update rule do not fit.
+            ValueError: The model, the data or the update rule do not fit, or the parameters diverge.
         """
         self._check(model, data, inner_loop)
         n_situations = len(data.x)
         meta_batch_size = min(self.meta_batch_size, n_situations)
-        h = model.embeddings.detach()[:, 0].expand(meta_batch_size, -1)
         optimizer = torch.optim.Adam(model.theta.parameters(), lr=self.meta_lr, foreach=True)
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda done: 1.0 - done / self.iterations)
         for iteration in range(self.iterations):
             drawn = torch.randperm(n_situations, generator=generator, device=generator.device)
             c = drawn[:meta_batch_size].to(data.x.device)
-            support, query = self._sample(data, c, generator)
+            support, query = self._sample(data, c.repeat_interleave(model.members), generator)
 
-            theta = expand(dict(model.theta.items()), meta_batch_size)
+            theta, h = expand(dict(model.theta.items()), meta_batch_size), model.embeddings_of(c)
             theta_tilde, loss_before = self._adapt(model, theta, h, support, inner_loop)
             loss_after = model.loss(theta_tilde, h, query).mean()
 
             optimizer.zero_grad()
-            torch.autograd.backward(loss_after)
-            # Where the inner steps nearly diverge, a few situations' gradients would drown all the others.
-            torch.nn.utils.clip_grad_norm_(model.theta.parameters(), self.max_grad_norm)
+            # The members know nothing of each other: each descends its own mean over the situations.
+            torch.autograd.backward(loss_after * model.members)
+            self._shorten_gradients(model)
             optimizer.step()
             schedule.step()
 
-            if not callback(MetaStep(iteration + 1, c, loss_before.mean().item(), loss_after.item())):
+            step = MetaStep(iteration + 1, c, loss_before.mean().item(), loss_after.item())
+            if not math.isfinite(step.loss_after):
+                raise ValueError(f"MAML diverged in iteration {step.iteration}; take a smaller inner_lr or meta_lr.")
+            if not callback(step):
                 return
 
     def _adapt(
@@ -105,8 +108,16 @@ class MAML:
             losses.append(loss.detach())
         return theta, losses[0]
 
+    def _shorten_gradients(self, model: Dynamics) -> None:
+        """Where the inner steps nearly diverge, a few situations' gradients would drown all the others."""
+        gradients = [value.grad for value in model.theta.values() if value.grad is not None]
+        squared = [gradient.flatten(1).square().sum(dim=1) for gradient in gradients]
+        factor = (self.max_grad_norm / (torch.stack(squared).sum(dim=0).sqrt() + 1e-6)).clamp(max=1.0)
+        for gradient in gradients:
+            gradient.mul_(factor.view(-1, *[1] * (gradient.ndim - 1)))
+
     def _sample(self, data: Batch, c: Tensor, generator: torch.Generator) -> tuple[Batch, Batch]:
-        """Transitions of each situation in ``c`` for the inner steps, and others to judge them by."""
+        """Transitions of the situations in ``c`` for the inner steps, and others to judge them by; own ones a row."""
         chance = torch.rand(len(c), data.x.shape[1], generator=generator, device=generator.device)
         order = chance.argsort(dim=1).to(data.x.device)
         support, query, _ = order.tensor_split([self.batch_size, self.batch_size + self.query_size], dim=1)

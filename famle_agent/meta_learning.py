@@ -62,7 +62,8 @@ class Reptile:
         """Runs Algorithm 1 on ``model`` in place.
 
         Args:
-            model: Randomly initialised model; its theta and embeddings become the meta-trained ones.
+            model: Randomly initialised model; its theta and embeddings become the meta-trained ones. With a single
+                embedding for many situations, which stays as it is, this is Reptile (Nichol et al., 2018).
             data: Encoded transitions of the N situations.
             inner_loop: U^k.
             generator: Source of all the chance.
@@ -71,10 +72,11 @@ class Reptile:
         Raises:
             ValueError: There are not as many situations in the data as embeddings in the model.
         """
-        n_situations = model.n_situations
-        if len(data.x) != n_situations:
+        n_situations = len(data.x)
+        shared = model.n_situations == 1 < n_situations
+        if not shared and model.n_situations != n_situations:
             raise ValueError(
-                f"The model has {n_situations} embeddings, the data {len(data.x)} situations; make them equal."
+                f"The model has {model.n_situations} embeddings, the data {n_situations} situations; make them equal."
             )
         meta_batch_size = min(self.meta_batch_size, n_situations)
         for iteration in range(self.iterations):
@@ -91,8 +93,9 @@ class Reptile:
             decay, members = 1.0 - iteration / self.iterations, model.members
             for name, value in model.theta.items():
                 value.lerp_(theta_tilde[name].view(-1, *value.shape).mean(dim=0), decay * self.meta_lr)
-            h = h.lerp(h_tilde, decay * self.embedding_meta_lr)
-            model.embeddings[:, c] = h.view(-1, members, h.shape[1]).transpose(0, 1)
+            if not shared:
+                h = h.lerp(h_tilde, decay * self.embedding_meta_lr)
+                model.embeddings[:, c] = h.view(-1, members, h.shape[1]).transpose(0, 1)
 
             step = MetaStep(iteration + 1, c, losses[0].mean().item(), losses[-1].mean().item())
             if not callback(step):

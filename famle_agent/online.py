@@ -69,11 +69,12 @@ class OnlineLoop:
         log_likelihood: Log-likelihood of a transition of each robot under each candidate, (B, C).
         infer: The belief with its posterior brought up to date after each transition, for the robots that had one.
         adapt: The belief with the model brought up to date (lines 6 and 7).
-        simulator: The model that a belief stands for.
+        simulator: The model that a belief stands for, given what the robots have seen.
         reward_fn: r(s, a, s') with actions in [-1, 1].
         planner: MPC (line 8).
         members: P, the models of the simulator for each robot; a plan is judged by their mean.
-        adapt_every: K; 0 never adapts.
+        adapt_every: K; 0 never adapts while an episode lasts.
+        adapt_at_reset: Whether to adapt when an episode ends.
         forget_at_reset: Whether a new episode empties a robot's memory.
     """
 
@@ -81,11 +82,12 @@ class OnlineLoop:
     log_likelihood: Callable[[Tensor, Tensor, Tensor], Tensor]
     infer: Callable[[Memory, Belief, Tensor], Belief]
     adapt: Callable[[Memory, Belief], Belief]
-    simulator: Callable[[Belief], Model]
+    simulator: Callable[[Belief, Memory], Model]
     reward_fn: RewardFn
     planner: Planner
     members: int
     adapt_every: int
+    adapt_at_reset: bool
     forget_at_reset: bool
 
     def begin(self, memory: Memory) -> OnlineState:
@@ -107,7 +109,8 @@ class OnlineLoop:
         memory = state.memory.add(*state.last, obs, self.log_likelihood(*state.last, obs), valid=~starts)
         if starts.all():
             return replace(state, last=None)
-        belief = self.infer(memory, state.belief, ~starts) if self.adapt_every else state.belief
+        adapts = self.adapt_every or self.adapt_at_reset
+        belief = self.infer(memory, state.belief, ~starts) if adapts else state.belief
         state = replace(state, memory=memory, belief=belief, last=None, steps=state.steps + 1)
         if self.adapt_every and state.steps % self.adapt_every == 0:
             state = replace(state, belief=self.adapt(state.memory, state.belief))
@@ -119,15 +122,18 @@ class OnlineLoop:
     ) -> tuple[Tensor, OnlineState]:
         """Plans an action in [-1, 1], (B, action_dim), with the adapted model (line 8)."""
         state = self.reset(state, starts)
-        simulator = self.simulator(state.belief)
+        simulator = self.simulator(state.belief, state.memory)
         action, plan = self.planner.plan(
             lambda tau: imagine(simulator, self.reward_fn, obs, tau, self.members), state.plan, generator
         )
         return action, replace(state, plan=shift(plan), last=(obs, action))
 
     def reset(self, state: OnlineState, starts: Tensor) -> OnlineState:
-        """Voids the plans of the robots in ``starts`` (B,), and their memories where it was asked for."""
+        """Voids the plans of the robots in ``starts`` (B,); adapts or empties their memories where it was asked for."""
         kept = ~starts
+        seen = starts & (state.memory.weight.sum(dim=1) > 0)
+        if self.adapt_at_reset and seen.any():
+            state = replace(state, belief=self.adapt(state.memory, state.belief).where(seen, state.belief))
         if self.forget_at_reset:
             memory = replace(state.memory, weight=state.memory.weight * kept[:, None])
             state = replace(state, memory=memory, belief=state.belief.where(kept, self.prior(state.robots)))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["ICEM", "MPPI", "Judge", "Model", "Planner", "RandomShooting", "RewardFn", "imagine", "shift"]
+__all__ = ["ICEM", "MPPI", "Judge", "Model", "Planner", "RandomShooting", "RewardFn", "bounded", "imagine", "shift"]
 
 _CANDIDATES_AT_ONCE = 2500
 
@@ -49,6 +49,11 @@ def imagine(model: Model, reward_fn: RewardFn, obs: Tensor, actions: Tensor, mem
     returns = torch.cat([_imagine(model, reward_fn, obs, part) for part in parts], dim=1)
     returns = torch.nan_to_num(returns, nan=-math.inf, posinf=-math.inf, neginf=-math.inf)
     return returns.view(-1, members, returns.shape[1]).mean(dim=1)
+
+
+def bounded(model: Model, low: Tensor, high: Tensor) -> Model:
+    """A model that predicts nothing outside of a range, (B, obs_dim) each."""
+    return lambda obs, action: model(obs, action).clamp(low[:, None], high[:, None])
 
 
 def _imagine(model: Model, reward_fn: RewardFn, obs: Tensor, actions: Tensor) -> Tensor:

@@ -108,20 +108,23 @@ class make_planning:  # noqa: N801
     Attributes:
         model: On the CPU.
         planner: Looks for the actions.
-        reward_fn: r(s, a, s') for actions of the environment; None takes the environment's own, see :data:`REWARDS`.
+        reward_fn: r(s, a, s') for actions of the environment; None takes the environment's own.
+        rewards: What the environment may call its own; the first that it has counts.
     """
 
     model: Dynamics
     planner: Planner
     reward_fn: RewardFn | None
+    rewards: tuple[str, ...] = REWARDS
 
     @torch.no_grad()
     def __call__(self, env: gym.Env[Any, Any], situation: int, rng: np.random.Generator) -> Policy:
         """See :data:`MakePolicy`."""
         scale = ActionScale.of(env.action_space, torch.device("cpu"))  # type: ignore[arg-type]
-        own = (env.get_wrapper_attr(name) for name in REWARDS if env.has_wrapper_attr(name))
+        own = (env.get_wrapper_attr(name) for name in self.rewards if env.has_wrapper_attr(name))
         in_env_units: RewardFn = self.reward_fn or next(own)
-        simulator = self.model.simulator(self.model.parameters_by_name(), self.model.embeddings[:, situation])
+        h = self.model.embeddings_of(torch.tensor([situation]))
+        simulator = self.model.simulator(self.model.parameters_by_name(), h)
         return PlanningPolicy(
             simulator,
             self.model.members,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 from typing_extensions import Self
 
-from famle_agent.dynamics import Dynamics
+from famle_agent.dynamics import Batch, Dynamics
 from famle_agent.envs import (
     EnvLike,
     SituationEnvs,
@@ -39,7 +39,7 @@ from famle_agent.errors import NotLearnedError
 from famle_agent.hyperparameters import Hyperparameters, robot_of
 from famle_agent.observation import DIMS, ObservationLayout
 from famle_agent.planning import RewardFn
-from famle_agent.policies import MakePolicy, make_held_uniform, make_planning
+from famle_agent.policies import REWARDS, MakePolicy, make_held_uniform, make_planning
 from famle_agent.reward import LearnedReward
 from famle_agent.run_folder import RunFolder
 from famle_agent.transitions import Transitions, collect
@@ -60,7 +60,8 @@ class SimulationLearner(BaseAlgorithm):
 
     Args:
         env: A robot's name (``"reacher"``), a Gymnasium id, an environment or a ``VecEnv`` with one robot each.
-        mode: ``"ours"`` for the settings that we found to be best, ``"paper"`` for the paper's.
+        mode: ``"ours"`` for the settings that we found to be best, ``"paper"`` for the paper's, ``"original"`` for
+            those of the authors' public code, where there is some for the robot.
         reward_fn: r(s, a, s') for torch tensors (..., dim) -> (...), what the planner maximises. None takes the
             environment's ``planning_reward_fn`` or ``reward_fn``, and where it has neither the reward is learnt with
             the dynamics.
@@ -86,6 +87,9 @@ class SimulationLearner(BaseAlgorithm):
         TypeError: An override is no setting.
         ValueError: The environment is unknown or its spaces are not supported, or a setting is out of range.
     """
+
+    _implied: ClassVar[Mapping[str, Any]] = {}
+    """Settings that the kind of agent implies, in every mode."""
 
     dynamics: Dynamics | None
     hyperparameters: Hyperparameters
@@ -128,14 +132,20 @@ class SimulationLearner(BaseAlgorithm):
         if self.env is not None:
             self._describe_env(self.env)
         robot = robot_of(self._env_spec["id"] if self._env_spec else None)
-        self.hyperparameters = robot.hyperparameters(mode, **overrides)
+        self.hyperparameters = robot.hyperparameters(mode, self._method(overrides), **{**self._implied, **overrides})
         self._reward_fn = reward_fn
+        if self.env is not None:
+            self._env_reward_fn = planning_reward(self.env, self._reward_names)
         self._learned_reward: LearnedReward | None = None
         self._dims = self._dims_of(angle_dims, quaternion_dims, pose_dims)
         self._generator = torch.Generator(self.device)
         self._setup_model()
         if pretrained and robot.pretrained is not None:
             self._load_pretrained(robot.pretrained)
+
+    def _method(self, overrides: Mapping[str, Any]) -> str:
+        """Under which name ``hyperparams/`` has settings that were tuned for this kind of agent; empty for FAMLE."""
+        return ""
 
     def _setup_model(self) -> None:
         self.dynamics = None
@@ -159,6 +169,7 @@ class SimulationLearner(BaseAlgorithm):
         wrapped = self._wrap_env(env, self.verbose)
         check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
         self._describe_env(wrapped)
+        self._env_reward_fn = planning_reward(wrapped, self._reward_names)
         self.n_envs = wrapped.num_envs
         super().set_env(wrapped, force_reset)
 
@@ -166,7 +177,6 @@ class SimulationLearner(BaseAlgorithm):
         if unwrap_vec_normalize(env) is not None:
             raise ValueError("The model normalises by itself; give the environment without VecNormalize.")
         self._env_spec = env_spec(env)
-        self._env_reward_fn = planning_reward(env)
 
     def _dims_of(self, *given: Sequence[int] | None) -> dict[str, tuple[int, ...]]:
         """The special dimensions of an observation by name: those that were given, else the environment's."""
@@ -325,7 +335,7 @@ class SimulationLearner(BaseAlgorithm):
             def reward_fn(obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
                 return learned(obs, scale.to_unit(action), next_obs)  # type: ignore[no-any-return]
 
-        return make_planning(model, self.hyperparameters.make_planner(), reward_fn)
+        return make_planning(model, self.hyperparameters.make_planner(), reward_fn, self._reward_names)
 
     def _fingerprint(self, source: SituationEnvs | Transitions) -> dict[str, Any]:
         """What two runs must have in common for one to go on where the other stopped."""
@@ -366,12 +376,26 @@ class SimulationLearner(BaseAlgorithm):
         hooks.update_locals(locals())
         return hooks.on_step()
 
-    def _new_dynamics(self, n_situations: int) -> Dynamics:
+    @property
+    @abstractmethod
+    def _n_embeddings(self) -> int:
+        """How many situations the model tells apart."""
+
+    def _begin_model(self, transitions: Transitions, round_: int) -> tuple[Dynamics, Batch]:
+        """The model, a new one in round 0, and the transitions as it sees them."""
+        obs, action, next_obs = self._tensors(transitions.obs, transitions.action, transitions.next_obs)
+        if round_ == 0:
+            self.dynamics = self._new_dynamics()
+            self.dynamics.fit_normalisation(obs, next_obs)
+        model = self._require_dynamics()
+        return model, model.encode(obs, action, next_obs)
+
+    def _new_dynamics(self) -> Dynamics:
         settings = self.hyperparameters
         return Dynamics(
             self.observation_space.shape[0],
             self.action_space.shape[0],
-            n_situations,
+            self._n_embeddings,
             settings.embedding_dim,
             settings.hidden,
             **self._dims,
@@ -384,6 +408,12 @@ class SimulationLearner(BaseAlgorithm):
     def _new_reward(self) -> LearnedReward:
         model = self._require_dynamics()
         return LearnedReward(model.layout, model.action_dim).to(self.device)
+
+    @property
+    def _reward_names(self) -> tuple[str, ...]:
+        """What the environment may call what the planner maximises."""
+        name = self.hyperparameters.planning_reward
+        return (name,) if name else REWARDS
 
     def _known_reward_fn(self) -> RewardFn | None:
         """The user's reward function, or the environment's."""

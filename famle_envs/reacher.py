@@ -108,8 +108,15 @@ class ReacherEnv(BulletEnv):
         Returns:
             Rewards in (0, 1], (...), in the type of ``next_obs``.
         """
-        dx, dy = next_obs[..., _TIP_X] - self.goal[0], next_obs[..., _TIP_Y] - self.goal[1]
-        return math.e ** -((dx * dx + dy * dy) ** 0.5)
+        return math.e ** -(self._squared_distance(next_obs) ** 0.5)
+
+    def squared_reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
+        """exp(-|tip' - goal|^2), what the planner of the authors' public code maximises; arguments as there."""
+        return math.e ** -self._squared_distance(next_obs)
+
+    def _squared_distance(self, obs: Any) -> Any:
+        dx, dy = obs[..., _TIP_X] - self.goal[0], obs[..., _TIP_Y] - self.goal[1]
+        return dx * dx + dy * dy
 
     @classmethod
     def sample_situation(cls, rng: np.random.Generator, n_faults: int = 2) -> Situation:

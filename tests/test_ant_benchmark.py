@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 import torch
 
-from benchmarks.ant import BIN, METHODS, Args, Task, damage_of, plot_speeds, run, summary, untrained
+from benchmarks.ant import ANT_METHODS, BIN, Args, damage_of, plot_speeds, run, summary, untrained
 from benchmarks.ant_model import accuracy
 from benchmarks.harness import Replicate, load_results, run_replicates
+from benchmarks.methods import Task
 from famle_agent.adaptation import Candidates
 from famle_envs.ant import AntEnv
 from tests.helpers import simple_model
@@ -34,8 +35,8 @@ def test_untrained_damages_are_of_four_kinds() -> None:
 def test_replicate_is_stored_and_summed_up(tmp_path: Path) -> None:
     args = Args(steps=2 * BIN, out=tmp_path)
     for method in ("famle", "famle-frozen"):
-        task = Task(0, damage_of("unseen", 0), args)
-        run_replicates([Replicate(method, 0, partial(run, method, task))], tmp_path / "ant-unseen", jobs=1)
+        task = Task("ant", 0, damage_of("unseen", 0), tmp_path)
+        run_replicates([Replicate(method, 0, partial(run, method, task, args))], tmp_path / "ant-unseen", jobs=1)
     results = load_results(tmp_path / "ant-unseen")
     assert [result["method"] for result in results] == ["famle", "famle-frozen"]
     for result in results:
@@ -49,7 +50,7 @@ def test_replicate_is_stored_and_summed_up(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("method", ["famle-nearest", "famle-theta", "members-2", "random-shooting"])
 def test_methods_are_the_shipped_agent_with_something_changed(method: str) -> None:
-    agent: Any = METHODS[method](Task(3, damage_of("unseen", 3), Args()))
+    agent: Any = ANT_METHODS[method].agent(Task("ant", 3, damage_of("unseen", 3), Path("unused")))
     settings = agent.hyperparameters
     assert agent.dynamics.members == (2 if method == "members-2" else 4)
     assert settings.compose == (method != "famle-nearest")

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from benchmarks import minitaur, quadruped
-from benchmarks.gait_robots import METHODS, Task, run
+from benchmarks.gait_robots import run
 from benchmarks.harness import Replicate, load_results, run_replicates
+from benchmarks.methods import METHODS, Task
 from famle_envs import Situation
 from famle_envs.quadruped import QuadrupedEnv
 
@@ -47,11 +48,11 @@ def test_replicate_is_stored_with_its_profile_and_summed_up(tmp_path: Path) -> N
 @pytest.mark.parametrize("robot", ["quadruped", "minitaur"])
 @pytest.mark.parametrize("method", ["famle", "famle-frozen", "famle-nearest", "famle-likeliest"])
 def test_methods_are_the_shipped_agent_with_something_changed(robot: str, method: str, tmp_path: Path) -> None:
-    agent: Any = METHODS[method](Task(robot, 3, Situation(), "reality", tmp_path))
+    agent: Any = METHODS[method].agent(Task(robot, 3, Situation(), tmp_path, "reality"))
     settings = agent.hyperparameters
     assert agent.dynamics is not None
     assert (settings.adapt_every == 0) == (method == "famle-frozen")
-    assert (settings.adaptation().steps == 0) == (method == "famle-nearest")
+    assert (settings.adaptation(seen=1).steps == 0) == (method == "famle-nearest")
     assert settings.spread_members == (method in ("famle", "famle-frozen"))
     agent.get_env().close()
 

@@ -25,7 +25,7 @@ def test_file_of_every_robot_builds_all_parts(robot: str, mode: str) -> None:
     assert settings.make_planner().horizon == settings.horizon
     assert settings.reptile().iterations == settings.meta_iterations
     assert settings.inner_loop().steps == settings.inner_steps
-    assert settings.adaptation().optimizer == settings.inner_optimizer
+    assert settings.adaptation(seen=1).optimizer == settings.inner_optimizer
 
 
 @every_robot
@@ -37,8 +37,12 @@ def test_robot_of_every_file_is_registered(robot: str) -> None:
 @every_robot
 @every_mode
 def test_file_names_no_setting_that_is_gone(robot: str, mode: str) -> None:
-    assert set(known_robots()[robot].modes) == set(MODES)
-    assert set(known_robots()[robot].modes[mode]) <= set(Hyperparameters().to_dict())
+    entry, known = known_robots()[robot], set(Hyperparameters().to_dict())
+    assert set(entry.modes) - {"original"} == set(MODES)
+    assert set(entry.modes[mode]) <= known
+    for rival in entry.rivals:
+        assert set(entry.rivals[rival]) <= known
+        assert entry.hyperparameters("paper", rival) == entry.hyperparameters("paper")
 
 
 @every_robot
@@ -108,8 +112,8 @@ def test_settings_of_the_life_on_a_robot_do_not_matter_for_what_was_learnt(chang
 
 def test_adaptation_inherits_what_is_not_said_otherwise() -> None:
     settings = Hyperparameters(inner_steps=11, inner_lr=0.1, embedding_lr=0.2)
-    assert settings.adaptation() == settings.inner_loop()
-    own = Hyperparameters(adapt_steps=0, adapt_lr=0.0, adapt_embedding_lr=0.5).adaptation()
+    assert settings.adaptation(seen=100) == settings.inner_loop()
+    own = Hyperparameters(adapt_steps=0, adapt_lr=0.0, adapt_embedding_lr=0.5).adaptation(seen=100)
     assert (own.steps, own.lr, own.embedding_lr) == (0, 0.0, 0.5)
 
 

@@ -1,0 +1,127 @@
+"""The paper's rivals of FAMLE, made of the same parts but without embeddings: AMPC and AMPC-MAML."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from famle_agent.adaptation import Belief, Memory, descend
+from famle_agent.agent import ModelBasedAgent
+from famle_agent.dynamics import expand
+from famle_agent.meta_learning import MetaStep
+from famle_agent.online import OnlineState
+from famle_agent.transitions import Transitions
+
+__all__ = ["AMPC", "AMPCMAML"]
+
+_EVERY_SITUATION = "every situation"
+
+
+class _OneModelAgent(ModelBasedAgent):
+    """An agent that does not tell situations apart: its model has one embedding, which never changes."""
+
+    _implied: ClassVar[Mapping[str, Any]] = {
+        **{"embedding_dim": 1, "embedding_lr": 0.0, "adapt_embedding_lr": 0.0, "joint_embedding_lr": 0.0},
+        **{"gate_actions": False, "interaction_rank": 0, "compose": False, "hazard": 0.0, "spread_members": False},
+    }
+
+    @property
+    def _n_embeddings(self) -> int:
+        return 1
+
+    def posterior(self, state: OnlineState | None = None) -> dict[str, float]:
+        """All the probability on the one model that there is."""
+        self._require_dynamics()
+        return {_EVERY_SITUATION: 1.0}
+
+    def marginals(self, state: OnlineState | None = None) -> dict[str, float]:
+        """As :meth:`posterior`."""
+        return self.posterior(state)
+
+    def _prior(self, robots: int) -> Belief:
+        model = self._require_dynamics()
+        c = torch.zeros(robots, dtype=torch.long, device=self.device)
+        theta, h = expand(model.parameters_by_name(), robots), model.embeddings_of(c)
+        return Belief(theta, h, torch.zeros(robots, 1, device=self.device))
+
+    def _log_likelihood(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
+        return torch.zeros(len(obs), 1, device=self.device)
+
+    def _infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
+        return belief
+
+    def _adapt(self, memory: Memory, belief: Belief) -> Belief:
+        """Theta* = k gradient steps from theta_meta on the last M transitions (the paper's eq. 3)."""
+        settings = self.hyperparameters
+        start = belief if settings.keep_adapting else self._prior(len(memory.weight))
+        start = replace(start, adaptations=belief.adaptations + 1)
+        steps = settings.adaptation(memory.seen)
+        return descend(self._require_dynamics(), start, memory, steps, settings.validation_size, self._sample())
+
+
+class AMPC(_OneModelAgent):
+    """Adaptive MPC: a model that is learnt on the robot from scratch, and planned with from the first step on.
+
+    Every K steps it takes k gradient steps on what the robot has gone through so far, each time from where it is. All
+    that it has from simulation is the scale of its inputs and outputs, which :meth:`meta_learn` measures (and the
+    reward where that is not known). Arguments as for :class:`~famle_agent.simulation.SimulationLearner`.
+
+    Example:
+        >>> from famle_agent import AMPC
+        >>> agent = AMPC("reacher", seed=0, transitions_per_situation=50).meta_learn()
+        >>> agent.posterior()
+        {'every situation': 1.0}
+    """
+
+    _implied: ClassVar[Mapping[str, Any]] = {
+        **_OneModelAgent._implied,
+        **{"rounds": 0, "joint_iterations": 0, "meta_iterations": 0, "keep_adapting": True},
+    }
+
+    def _method(self, overrides: Mapping[str, Any]) -> str:
+        return "ampc"
+
+    def _learn_model(
+        self, transitions: Transitions, round_: int, last: bool, on_iteration: Callable[[dict[str, float]], bool]
+    ) -> None:
+        """A network with random weights."""
+        self._begin_model(transitions, round_)
+
+
+class AMPCMAML(_OneModelAgent):
+    """Adaptive MPC whose model was meta-learned, as one starting point for all situations.
+
+    Every K steps it takes k gradient steps on the last M transitions, each time from the meta-learned theta. The
+    setting ``meta_learner`` says how that is learnt: ``"reptile"`` (Nichol et al., 2018; Algorithm 1 without
+    embeddings), ``"first-order-maml"`` or ``"maml"`` (Finn et al., 2017; the paper's eq. 3 to 5). Arguments as for
+    :class:`~famle_agent.simulation.SimulationLearner`.
+
+    Example:
+        >>> from famle_agent import AMPCMAML
+        >>> agent = AMPCMAML("reacher", meta_learner="maml", seed=0, meta_iterations=2, transitions_per_situation=200)
+        >>> agent.meta_learn().posterior()
+        {'every situation': 1.0}
+    """
+
+    def _method(self, overrides: Mapping[str, Any]) -> str:
+        return str(overrides.get("meta_learner", "reptile"))
+
+    def _learn_model(
+        self, transitions: Transitions, round_: int, last: bool, on_iteration: Callable[[dict[str, float]], bool]
+    ) -> None:
+        """Training on all situations at once in each round, and in the last one Reptile or MAML."""
+        settings, (model, data) = self.hyperparameters, self._begin_model(transitions, round_)
+
+        def log(step: MetaStep) -> bool:
+            return on_iteration({"meta/loss_before": step.loss_before, "meta/loss_after": step.loss_after})
+
+        joint_training = settings.joint_training(round_)
+        finished = joint_training(model, data, self._generator, lambda loss: on_iteration({"meta/joint_loss": loss}))
+        if last and finished and settings.meta_iterations:
+            learn = settings.reptile() if settings.meta_learner == "reptile" else settings.maml()
+            learn(model, data, settings.inner_loop(), self._generator, log)
+        model.fit_noise(data)

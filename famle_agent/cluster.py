@@ -1,0 +1,55 @@
+"""Where parallel work runs: processes on this machine, or a Ray cluster."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Literal
+
+from joblib import parallel_config
+
+__all__ = ["Backend", "parallel"]
+
+Backend = Literal["loky", "ray"]
+"""Names of joblib backends."""
+
+
+@contextmanager
+def parallel(backend: Backend = "loky") -> Iterator[None]:
+    """Sends the parallel work that is begun inside to a backend.
+
+    Args:
+        backend: ``"loky"`` for processes on this machine. ``"ray"`` for the Ray cluster that this process is connected
+            to, else the one at the address in ``RAY_ADDRESS``, else one of this machine's cores, which ends with the
+            work.
+
+    Raises:
+        ImportError: Ray is not installed.
+        ConnectionError: There is no cluster at the address.
+
+    Example:
+        >>> from famle_agent import FAMLE
+        >>> from famle_agent.cluster import parallel
+        >>> with parallel("loky"):
+        ...     transitions = FAMLE("reacher", seed=0, transitions_per_situation=50).collect(n_jobs=2)
+    """
+    if backend == "loky":
+        with parallel_config("loky"):
+            yield
+        return
+    try:
+        import ray
+        from ray.util.joblib import register_ray
+    except ImportError as error:
+        raise ImportError('Ray is not installed; install it with: pip install "famle[ray]"') from error
+    register_ray()
+    connected = ray.is_initialized()
+    if not connected:
+        ray.init(address=os.environ.get("RAY_ADDRESS"), log_to_driver=False, configure_logging=False)
+    try:
+        with parallel_config("ray"):
+            yield
+    finally:
+        if not connected:
+            ray.shutdown()
