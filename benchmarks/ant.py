@@ -173,7 +173,7 @@ def run(method: str, task: Task, args: Args) -> Result:
     """One replicate: broken from the first step, or after 300 steps."""
     agent = ANT_METHODS[method].agent(task)
     if args.experiment == "curves":
-        return curves.run(agent, task, args.ppo_steps if method in PPO_METHODS else args.curve_steps)
+        return curves.run(agent, [task], args.ppo_steps if method in PPO_METHODS else args.curve_steps)[0]
     if not isinstance(agent, ModelBasedAgent):
         raise ValueError(f"{method} learns too little in one episode to be compared in it; see --experiment curves.")
     agent.set_random_seed(task.seed)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from benchmarks.harness import Options, Replicate, Result, run_replicates
+from benchmarks.harness import Fleet, Options, Replicate, Result, is_stored, run_replicates
 from benchmarks.methods import METHODS, Method, Task
 
 __all__ = ["compare"]
@@ -19,6 +19,7 @@ def compare(
     folder: Path,
     options: Options,
     known: Mapping[str, Method] = METHODS,
+    run_fleet: Callable[[str, Sequence[Task]], list[Result]] | None = None,
 ) -> None:
     """Runs every method on every test robot, but for what is stored.
 
@@ -29,6 +30,7 @@ def compare(
         folder: Where the results go.
         options: How they are run.
         known: All methods by name.
+        run_fleet: Makes the results of a method and many tasks, for methods whose robots can act in step.
 
     Raises:
         ValueError: A method is unknown.
@@ -37,7 +39,11 @@ def compare(
         if method not in known:
             raise ValueError(f"There is no method {method!r}. Methods: {', '.join(known)}.")
     for method in methods:
-        replicates = [Replicate(method, task.seed, partial(run, method, task)) for task in tasks]
-        if not all(replicate.path(folder).exists() for replicate in replicates):
+        replicates: list[Replicate | Fleet]
+        if run_fleet is not None and known[method].fleet is not None:
+            replicates = [Fleet(method, tuple(task.seed for task in tasks), partial(run_fleet, method, tasks))]
+        else:
+            replicates = [Replicate(method, task.seed, partial(run, method, task)) for task in tasks]
+        if not all(is_stored(some, folder) for some in replicates):
             known[method].learn(tasks[0])  # once, before the replicates want it in their processes
         run_replicates(replicates, folder, options.jobs, options.backend)

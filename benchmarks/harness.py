@@ -13,12 +13,22 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from joblib import Parallel, delayed
+from joblib import delayed
 from tqdm import tqdm
 
-from famle_agent.cluster import Backend, parallel
+from famle_agent.cluster import Backend, as_completed, parallel
 
-__all__ = ["Options", "Replicate", "Result", "load_results", "provenance", "run_replicates", "write_json"]
+__all__ = [
+    "Fleet",
+    "Options",
+    "Replicate",
+    "Result",
+    "is_stored",
+    "load_results",
+    "provenance",
+    "run_replicates",
+    "write_json",
+]
 
 Result = dict[str, Any]
 _PACKAGES = ("famle", "gymnasium", "matplotlib", "numpy", "pybullet", "scipy", "stable-baselines3", "torch")
@@ -56,13 +66,33 @@ class Replicate:
     seed: int
     run: Callable[[], Result]
 
-    def path(self, folder: Path) -> Path:
-        """Where the result is stored."""
-        return folder / f"{self.method}-{self.seed}.json"
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """As of a :class:`Fleet`."""
+        return (self.seed,)
+
+    def results(self) -> list[Result]:
+        """As of a :class:`Fleet`."""
+        return [self.run()]
 
 
-def run_replicates(replicates: Iterable[Replicate], folder: Path, jobs: int, backend: Backend = "loky") -> None:
-    """Runs what is not stored yet.
+@dataclass(frozen=True)
+class Fleet:
+    """Seeds of one method whose robots act in step, so that their networks cost one batched product.
+
+    Attributes:
+        method: What is run.
+        seeds: Seeds of the replicates.
+        results: Makes the result of each; picklable.
+    """
+
+    method: str
+    seeds: tuple[int, ...]
+    results: Callable[[], list[Result]]
+
+
+def run_replicates(replicates: Iterable[Replicate | Fleet], folder: Path, jobs: int, backend: Backend = "loky") -> None:
+    """Runs what is not stored yet; of a fleet, all replicates where one is missing.
 
     Args:
         replicates: What to run.
@@ -73,19 +103,28 @@ def run_replicates(replicates: Iterable[Replicate], folder: Path, jobs: int, bac
     Raises:
         Exception: What a replicate raised, after all others have run and are stored.
     """
-    todo = [replicate for replicate in replicates if not replicate.path(folder).exists()]
-    calls = (delayed(_run_one)(replicate) for replicate in todo)
+    todo = [some for some in replicates if not is_stored(some, folder)]
+    calls = (delayed(_run)(some) for some in todo)
     failure: Exception | None = None
-    with parallel(backend), tqdm(total=len(todo), desc=str(folder), unit="replicate") as bar:
-        for replicate, result in Parallel(n_jobs=jobs, return_as="generator_unordered")(calls):
-            if isinstance(result, Exception):
-                failure = failure or result
+    with (
+        parallel(backend),
+        tqdm(total=sum(len(some.seeds) for some in todo), desc=str(folder), unit="replicate") as bar,
+    ):
+        for some, results in as_completed(calls, jobs):
+            if isinstance(results, Exception):
+                failure = failure or results
             else:
-                write_json(replicate.path(folder), result | provenance(sys.argv))
-            bar.set_postfix_str(f"{replicate.method}-{replicate.seed}")
-            bar.update()
+                for seed, result in zip(some.seeds, results, strict=True):
+                    write_json(_path(folder, some.method, seed), result | provenance(sys.argv))
+            bar.set_postfix_str(f"{some.method}-{some.seeds[-1]}")
+            bar.update(len(some.seeds))
     if failure is not None:
         raise failure
+
+
+def is_stored(some: Replicate | Fleet, folder: Path) -> bool:
+    """Whether there is a result of every seed."""
+    return all(_path(folder, some.method, seed).exists() for seed in some.seeds)
 
 
 def load_results(folder: Path) -> list[Result]:
@@ -104,7 +143,7 @@ def provenance(argv: list[str]) -> Result:
     """What it takes to run something again: command, commit and versions."""
     commit = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False)
     return {
-        "command": " ".join(["python", *_command(argv)]),
+        "command": " ".join(_command(argv)),
         "commit": commit.stdout.strip() or "unknown",
         "versions": {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES},
     }
@@ -118,22 +157,33 @@ def write_json(path: Path, value: Any) -> None:
     partial.replace(path)
 
 
-def _run_one(replicate: Replicate) -> tuple[Replicate, Result | Exception]:
-    """The result of a replicate, or what it raised: one that fails must not end the others."""
+def _path(folder: Path, method: str, seed: int) -> Path:
+    return folder / f"{method}-{seed}.json"
+
+
+def _run(some: Replicate | Fleet) -> tuple[Replicate | Fleet, list[Result] | Exception]:
+    """The results, or what was raised instead: a replicate that fails must not end the others."""
     import torch
 
     torch.set_num_threads(1)  # replicates that run at the same time share the cores
     start = time.perf_counter()
     try:
-        result = replicate.run()
+        results = some.results()
     except Exception as error:
-        error.add_note(f"Raised by {replicate.method}-{replicate.seed}.")
-        return replicate, error
-    named = {"method": replicate.method, "seed": replicate.seed, **result}
-    return replicate, named | {"wall_seconds": time.perf_counter() - start}
+        error.add_note(f"Raised by {some.method}, seed {some.seeds[0]}.")
+        return some, error
+    shared = {"wall_seconds": time.perf_counter() - start} | (
+        {} if len(some.seeds) == 1 else {"fleet": len(some.seeds)}
+    )
+    return some, [
+        {"method": some.method, "seed": seed, **result, **shared}
+        for seed, result in zip(some.seeds, results, strict=True)
+    ]
 
 
 def _command(argv: list[str]) -> list[str]:
-    """The command line with a module instead of its file's path."""
+    """The command line as a user types it, instead of the path of the file that it runs."""
     script = Path(argv[0])
-    return (["-m", f"benchmarks.{script.stem}"] if script.parent.name == "benchmarks" else [script.name]) + argv[1:]
+    if script.parent.name == "benchmarks":
+        return ["python", "-m", f"benchmarks.{script.stem}", *argv[1:]]
+    return [script.name, *argv[1:]] if script.suffix != ".py" else ["python", script.name, *argv[1:]]

@@ -6,13 +6,14 @@ A method is one entry of :data:`METHODS`; every benchmark takes its agents from 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
@@ -72,10 +73,13 @@ class Method:
     Attributes:
         agent: Makes the agent of a task, with all that it knows from simulation.
         learn: Learns in simulation what the replicates share, into the cache; does nothing where that is there.
+        fleet: Makes one agent for the robots of many tasks, in which each robot has the network of its own replicate;
+            None where replicates run one by one.
     """
 
     agent: Callable[[Task], BaseAlgorithm]
     learn: Callable[[Task], object] = lambda task: None
+    fleet: Callable[[Sequence[Task]], ModelBasedAgent] | None = None
 
 
 # --- FAMLE ------------------------------------------------------------------------------------------------------------
@@ -169,6 +173,22 @@ class MetaTrained:
         one.dynamics = many._require_dynamics().with_members(1, first=task.seed % SIDE_BY_SIDE)
         return one
 
+    def fleet(self, tasks: Sequence[Task]) -> ModelBasedAgent:
+        """One agent whose robots have the networks of their replicates.
+
+        Raises:
+            ValueError: Robots would go back to a network that is not theirs.
+        """
+        agent, many = self.agent(tasks[0]), self.cls.load(self.learn(tasks[0]), device="cpu")._require_dynamics()
+        if not agent.hyperparameters.keep_adapting:
+            raise ValueError(f"The robots of {self.name} do not keep their networks; run them one by one.")
+        rows = torch.tensor([task.seed % SIDE_BY_SIDE for task in tasks])
+        state = agent._state_of(len(tasks))
+        theta = {name: value[rows] for name, value in many.parameters_by_name().items()}
+        belief = replace(state.belief, theta=theta, h=many.embeddings.detach()[rows, 0])
+        agent._live = replace(state, belief=belief)
+        return agent
+
     def learn(self, task: Task) -> Path:
         """The file of the agents of all replicates, which is made where it is not there."""
         path = task.cache / f"{task.robot}-{self.name}.zip"
@@ -247,9 +267,11 @@ def _learn_ppo(task: Task) -> Path:
 # --- what they are called ---------------------------------------------------------------------------------------------
 
 
-def _meta_trained(name: str, cls: type[ModelBasedAgent], mode: str = "ours", **settings: Any) -> Method:
+def _meta_trained(
+    name: str, cls: type[ModelBasedAgent], mode: str = "ours", in_step: bool = False, **settings: Any
+) -> Method:
     recipe = MetaTrained(name, cls, mode, settings)
-    return Method(recipe.agent, recipe.learn)
+    return Method(recipe.agent, recipe.learn, recipe.fleet if in_step else None)
 
 
 METHODS: dict[str, Method] = {
@@ -260,10 +282,10 @@ METHODS: dict[str, Method] = {
     "famle-nearest": Method(partial(famle, adapt_steps=0, compose=False, spread_members=False)),
     "famle-paper": _meta_trained("paper", FAMLE, "paper"),
     "famle-original": _meta_trained("original", FAMLE, "original"),
-    "ampc": _meta_trained("ampc", AMPC),
-    "ampc-reptile": _meta_trained("reptile", AMPCMAML, meta_learner="reptile"),
-    "ampc-fomaml": _meta_trained("fomaml", AMPCMAML, meta_learner="first-order-maml"),
-    "ampc-maml": _meta_trained("maml", AMPCMAML, meta_learner="maml"),
+    "ampc": _meta_trained("ampc", AMPC, in_step=True),
+    "ampc-reptile": _meta_trained("reptile", AMPCMAML, in_step=True, meta_learner="reptile"),
+    "ampc-fomaml": _meta_trained("fomaml", AMPCMAML, in_step=True, meta_learner="first-order-maml"),
+    "ampc-maml": _meta_trained("maml", AMPCMAML, in_step=True, meta_learner="maml"),
     "ppo": Method(ppo),
     "ppo-pretrained": Method(ppo_pretrained, _learn_ppo),
     "oracle": Method(oracle),

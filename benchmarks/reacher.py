@@ -6,6 +6,7 @@ python -m benchmarks.reacher --damage random --replicates 20 --steps 300
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -52,7 +53,15 @@ def situation_of(damage: str, seed: int) -> Situation:
 def run(method: str, task: Task, args: Args) -> Result:
     """One replicate."""
     steps = args.ppo_steps if method in PPO_METHODS else args.steps
-    return curves.run(METHODS[method].agent(task), task, steps)
+    return curves.run(METHODS[method].agent(task), [task], steps)[0]
+
+
+def run_fleet(method: str, tasks: Sequence[Task], args: Args) -> list[Result]:
+    """All replicates of a method in step."""
+    fleet = METHODS[method].fleet
+    if fleet is None:
+        raise ValueError(f"The replicates of {method} run one by one.")
+    return curves.run(fleet(tasks), tasks, args.steps)
 
 
 def main(args: Args) -> None:
@@ -60,7 +69,7 @@ def main(args: Args) -> None:
     methods = args.methods or (*MODEL_BASED, *PPO_METHODS, "famle-frozen", "oracle")
     tasks = [Task("reacher", seed, situation_of(args.damage, seed), args.cache) for seed in range(args.replicates)]
     folder = args.out / f"reacher-{args.damage}"
-    compare(methods, tasks, partial(run, args=args), folder, args)
+    compare(methods, tasks, partial(run, args=args), folder, args, run_fleet=partial(run_fleet, args=args))
     results = load_results(folder)
     title = f"Reacher, {args.damage} damage"
     Console(width=160).print(summary(results, SOLVED, title, within=200))

@@ -1,4 +1,4 @@
-"""``famle demo | meta-learn | run``."""
+"""``famle demo | meta-learn | run | benchmark | report``."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import torch
 import tyro
 from rich.console import Console
 
+from benchmarks.suite import Benchmark
 from famle_agent.demo import run_demo, run_episode
 from famle_agent.errors import NotLearnedError
 from famle_agent.famle import FAMLE
@@ -115,8 +116,10 @@ def main(args: list[str] | None = None) -> None:
     Args:
         args: The command line without the program's name; None takes the process's own.
     """
-    command: Demo | MetaLearn | Run = tyro.extras.subcommand_cli_from_dict(
-        {"demo": Demo, "meta-learn": MetaLearn, "run": Run}, args=args, prog="famle"
+    command = tyro.extras.subcommand_cli_from_dict(
+        {"demo": Demo, "meta-learn": MetaLearn, "run": Run, "benchmark": Benchmark},
+        args=args,
+        prog="famle",
     )
     if not isinstance(command, MetaLearn):
         # A plan's matrices are small: a second thread gains little, and waits long where the machine is busy.

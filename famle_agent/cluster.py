@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Literal
+from itertools import islice
+from typing import Any, Literal
 
-from joblib import parallel_config
+from joblib import Parallel, effective_n_jobs, parallel_config
+from joblib.parallel import get_active_backend
 
-__all__ = ["Backend", "parallel"]
+__all__ = ["Backend", "as_completed", "parallel"]
 
 Backend = Literal["loky", "ray"]
 """Names of joblib backends."""
@@ -43,7 +45,7 @@ def parallel(backend: Backend = "loky") -> Iterator[None]:
         from ray.util.joblib import register_ray
     except ImportError as error:
         raise ImportError('Ray is not installed; install it with: pip install "famle[ray]"') from error
-    register_ray()
+    register_ray()  # type: ignore[no-untyped-call]
     connected = ray.is_initialized()
     if not connected:
         ray.init(address=os.environ.get("RAY_ADDRESS"), log_to_driver=False, configure_logging=False)
@@ -53,3 +55,21 @@ def parallel(backend: Backend = "loky") -> Iterator[None]:
     finally:
         if not connected:
             ray.shutdown()
+
+
+def as_completed(calls: Iterable[Any], n_jobs: int) -> Iterator[Any]:
+    """Runs calls in parallel and yields their results as they come.
+
+    Args:
+        calls: Made with ``joblib.delayed``.
+        n_jobs: Calls that run at the same time, -1 for one a core of the machine or the cluster.
+    """
+    backend, _ = get_active_backend()
+    if backend.supports_return_generator:
+        yield from Parallel(n_jobs=n_jobs, return_as="generator_unordered")(calls)
+        return
+    # Ray gives no result before it has all of them, and so is given no more calls at a time than it has workers.
+    waiting = iter(calls)
+    with Parallel(n_jobs=n_jobs) as workers:
+        while some := list(islice(waiting, effective_n_jobs(n_jobs))):
+            yield from workers(some)

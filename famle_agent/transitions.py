@@ -15,8 +15,9 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 import torch
-from joblib import Parallel, delayed
+from joblib import delayed
 
+from famle_agent.cluster import as_completed
 from famle_agent.policies import MakePolicy
 
 __all__ = ["EnvSource", "Transitions", "collect"]
@@ -154,8 +155,7 @@ def collect(
     for here in (True, False):
         some = [task for task in tasks if isinstance(task.env, gym.Env) == here]
         calls = (delayed(_in_process if n_jobs != 1 and not here else _Task.run)(task) for task in some)
-        workers = Parallel(n_jobs=1 if here else n_jobs, return_as="generator_unordered")
-        for i, part in workers(calls):
+        for i, part in as_completed(calls, n_jobs=1 if here else n_jobs):
             parts[i] = part
             callback(n)
     arrays = {
