@@ -23,9 +23,10 @@ from benchmarks.ant import ADAPTS, damage_of
 from benchmarks.harness import provenance, write_json
 from benchmarks.methods import shipped
 from famle_agent import FAMLE, Transitions
-from famle_agent.adaptation import Belief, Candidates, Memory, adapt, prior, window_posterior
+from famle_agent.adaptation import Belief, Candidates, adapt, prior, window_posterior
 from famle_agent.dynamics import Batch, Dynamics
 from famle_agent.inner_loop import InnerLoop
+from famle_agent.memory import Memory
 from famle_agent.policies import make_held_uniform
 from famle_agent.transitions import collect
 from famle_envs import Situation

@@ -36,10 +36,11 @@ from torch import Tensor
 
 from benchmarks.harness import Result, provenance, write_json
 from benchmarks.report import interquartile_mean, quartiles
-from famle_agent.adaptation import Candidates, Memory, adapt, prior, window_posterior
+from famle_agent.adaptation import Candidates, adapt, prior, window_posterior
 from famle_agent.dynamics import Dynamics
 from famle_agent.inner_loop import InnerLoop
 from famle_agent.maml import MAML
+from famle_agent.memory import Memory
 from famle_agent.meta_learning import Reptile
 from famle_agent.plots import style
 

@@ -16,9 +16,10 @@ from stable_baselines3.common.utils import safe_mean
 from torch import Tensor
 from typing_extensions import Self
 
-from famle_agent.adaptation import Belief, Memory, Sample, minibatches, whole_memory
+from famle_agent.adaptation import Belief
 from famle_agent.checkpoint import File, load_agent, load_pretrained, restore_agent, save_agent
 from famle_agent.dashboard import log_posterior
+from famle_agent.memory import Memory, Sample, minibatches, whole_memory
 from famle_agent.online import OnlineLoop, OnlineState
 from famle_agent.planning import Model, Planner, RewardFn, bounded
 from famle_agent.simulation import SimulationLearner
@@ -36,7 +37,7 @@ class ModelBasedAgent(SimulationLearner):
     """An agent that learns a model in simulation, adapts it on the robot, and plans with it.
 
     Subclasses say how the model is learnt (:meth:`_learn_model`) and how it is adapted (:meth:`_prior`,
-    :meth:`_adapt`). Arguments as for :class:`~famle_agent.simulation.SimulationLearner`.
+    :meth:`_adapt`). Arguments as for :class:`~famle_agent.algorithm.ModelBasedAlgorithm`.
     """
 
     planner: Planner

@@ -9,9 +9,10 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation import Belief, Memory, descend
+from famle_agent.adaptation import Belief, descend
 from famle_agent.agent import ModelBasedAgent
 from famle_agent.dynamics import expand
+from famle_agent.memory import Memory
 from famle_agent.meta_learning import MetaStep
 from famle_agent.online import OnlineState
 from famle_agent.transitions import Transitions
@@ -68,7 +69,7 @@ class AMPC(_OneModelAgent):
 
     Every K steps it takes k gradient steps on what the robot has gone through so far, each time from where it is. All
     that it has from simulation is the scale of its inputs and outputs, which :meth:`meta_learn` measures (and the
-    reward where that is not known). Arguments as for :class:`~famle_agent.simulation.SimulationLearner`.
+    reward where that is not known). Arguments as for :class:`~famle_agent.algorithm.ModelBasedAlgorithm`.
 
     Example:
         >>> from famle_agent import AMPC
@@ -98,7 +99,7 @@ class AMPCMAML(_OneModelAgent):
     Every K steps it takes k gradient steps on the last M transitions, each time from the meta-learned theta. The
     setting ``meta_learner`` says how that is learnt: ``"reptile"`` (Nichol et al., 2018; Algorithm 1 without
     embeddings), ``"first-order-maml"`` or ``"maml"`` (Finn et al., 2017; the paper's eq. 3 to 5). Arguments as for
-    :class:`~famle_agent.simulation.SimulationLearner`.
+    :class:`~famle_agent.algorithm.ModelBasedAlgorithm`.
 
     Example:
         >>> from famle_agent import AMPCMAML

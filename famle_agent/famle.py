@@ -8,9 +8,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation import Belief, Candidates, Memory, adapt, filtered_posterior, prior, window_posterior
+from famle_agent.adaptation import Belief, Candidates, adapt, filtered_posterior, prior, window_posterior
 from famle_agent.agent import ModelBasedAgent
 from famle_agent.dashboard import log_embeddings
+from famle_agent.memory import Memory
 from famle_agent.meta_learning import MetaStep
 from famle_agent.online import OnlineState
 from famle_agent.transitions import Transitions
@@ -21,7 +22,7 @@ __all__ = ["FAMLE"]
 class FAMLE(ModelBasedAgent):
     """Meta-learns one network and one embedding per situation in simulation; picks and adapts them on the robot.
 
-    Arguments as for :class:`~famle_agent.simulation.SimulationLearner`.
+    Arguments as for :class:`~famle_agent.algorithm.ModelBasedAlgorithm`.
 
     Example:
         >>> from famle_agent import FAMLE

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation import Belief, Memory
+from famle_agent.adaptation import Belief
+from famle_agent.memory import Memory
 from famle_agent.planning import Model, Planner, RewardFn, imagine, shift
 
 __all__ = ["OnlineLoop", "OnlineState"]

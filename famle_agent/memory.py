@@ -1,0 +1,104 @@
+"""What robots have gone through, and which of it a gradient step sees."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from famle_agent.dynamics import Batch
+
+__all__ = ["Memory", "Sample", "minibatches", "whole_memory"]
+
+
+@dataclass(frozen=True)
+class Memory:
+    """D_M, the last M transitions of B robots, oldest first. Immutable: :meth:`add` returns a new one.
+
+    Attributes:
+        obs: (B, M, obs_dim).
+        action: In [-1, 1], (B, M, action_dim).
+        next_obs: (B, M, obs_dim).
+        log_p: Log-likelihood of each transition under each candidate, (B, M, C). It does not change as long as
+            theta_meta does not, so that it is computed once for each transition.
+        weight: 1 for a transition, 0 for a place that is empty yet, (B, M).
+    """
+
+    obs: Tensor
+    action: Tensor
+    next_obs: Tensor
+    log_p: Tensor
+    weight: Tensor
+
+    @classmethod
+    def empty(
+        cls, robots: int, size: int, obs_dim: int, action_dim: int, candidates: int, device: torch.device
+    ) -> Memory:
+        """A memory of ``size`` M for B robots that have seen nothing."""
+        obs, action, log_p = (
+            torch.zeros(robots, size, dim, device=device) for dim in (obs_dim, action_dim, candidates)
+        )
+        return cls(obs, action, obs, log_p, torch.zeros(robots, size, device=device))
+
+    @property
+    def seen(self) -> int:
+        """Transitions of the robot that has most of them."""
+        return int(self.weight.sum(dim=1).max())
+
+    def range(self) -> tuple[Tensor, Tensor]:
+        """Least and largest value of each observed number, (B, obs_dim); infinite for a robot that has seen nothing."""
+        empty = self.weight[..., None] == 0.0
+        low = torch.minimum(self.obs, self.next_obs).masked_fill(empty, math.inf).amin(dim=1)
+        high = torch.maximum(self.obs, self.next_obs).masked_fill(empty, -math.inf).amax(dim=1)
+        nothing = low > high
+        return low.masked_fill(nothing, -math.inf), high.masked_fill(nothing, math.inf)
+
+    def resized(self, size: int) -> Memory:
+        """The newest ``size`` places, with empty ones in front where there are fewer."""
+
+        def fit(values: Tensor) -> Tensor:
+            empty = values.new_zeros(len(values), size, *values.shape[2:])
+            return torch.cat([empty, values], dim=1)[:, -size:]
+
+        return Memory(fit(self.obs), fit(self.action), fit(self.next_obs), fit(self.log_p), fit(self.weight))
+
+    def add(self, obs: Tensor, action: Tensor, next_obs: Tensor, log_p: Tensor, valid: Tensor) -> Memory:
+        """Inserts one transition per robot where ``valid`` (B,), and drops that robot's oldest."""
+
+        def push(old: Tensor, new: Tensor) -> Tensor:
+            moved = torch.cat([old[:, 1:], new[:, None]], dim=1)
+            return torch.where(valid.view(-1, *[1] * (old.ndim - 1)), moved, old)
+
+        return Memory(
+            push(self.obs, obs),
+            push(self.action, action),
+            push(self.next_obs, next_obs),
+            push(self.log_p, log_p),
+            push(self.weight, torch.ones_like(valid, dtype=obs.dtype)),
+        )
+
+
+Sample = Callable[[Batch], Batch]
+"""Chooses the transitions of a gradient step."""
+
+
+def whole_memory(data: Batch) -> Batch:
+    """All transitions in each step, as in the paper."""
+    return data
+
+
+def minibatches(size: int, generator: torch.Generator) -> Sample:
+    """Transitions drawn anew for each step, ``size`` of each row, with repetitions."""
+
+    def sample(data: Batch) -> Batch:
+        chance = torch.rand(len(data.weight), size, generator=generator, device=generator.device)
+        nth = (chance.to(data.weight.device) * data.weight.sum(dim=1, keepdim=True)).floor()
+        # Of the transitions that count, the nth is where their running number passes n.
+        i = torch.searchsorted(data.weight.cumsum(dim=1), nth, right=True).clamp(max=data.weight.shape[1] - 1)
+        rows = torch.arange(len(i), device=i.device)[:, None]
+        return Batch(data.x[rows, i], data.y[rows, i], data.weight[rows, i])
+
+    return sample
