@@ -30,8 +30,6 @@ from famle_envs.wrappers import RandomSituation
 
 __all__ = ["METHODS", "PPO_METHODS", "Method", "Task", "famle", "shipped"]
 
-SIDE_BY_SIDE = 30  # replicates whose networks are meta-trained as the members of one ensemble
-
 
 @dataclass(frozen=True)
 class Task:
@@ -147,20 +145,22 @@ def one_simulator(task: Task) -> FAMLE:
 class MetaTrained:
     """An agent whose meta-training the package does not ship.
 
-    Where FAMLE's is shipped, all replicates share one model, as they share that one. Else each of
-    :data:`SIDE_BY_SIDE` replicates has a network of its own, all of them trained on the same simulated data: they are
-    the members of one ensemble, which know nothing of each other, so that they cost little more than one would.
+    Where FAMLE's is shipped, all replicates share one model, as they share that one. Else replicates take turns with
+    ``networks`` networks, all of them trained on the same simulated data: they are the members of one ensemble, which
+    know nothing of each other, so that they cost less than one after the other would.
 
     Attributes:
         name: Of the file in the cache.
         cls: The kind of agent.
         mode: Of its settings.
+        networks: Replicate i has network i, counted round.
         settings: Settings to change.
     """
 
     name: str
     cls: type[ModelBasedAgent]
     mode: str = "ours"
+    networks: int = 10
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def agent(self, task: Task) -> ModelBasedAgent:
@@ -170,7 +170,7 @@ class MetaTrained:
             return self.cls.load(path, device="cpu")
         many, one = self.cls.load(path, device="cpu"), self._new(task.robot, task.seed)
         one.situations = many.situations
-        one.dynamics = many._require_dynamics().with_members(1, first=task.seed % SIDE_BY_SIDE)
+        one.dynamics = many._require_dynamics().with_members(1, first=task.seed % self.networks)
         return one
 
     def fleet(self, tasks: Sequence[Task]) -> ModelBasedAgent:
@@ -182,7 +182,7 @@ class MetaTrained:
         agent, many = self.agent(tasks[0]), self.cls.load(self.learn(tasks[0]), device="cpu")._require_dynamics()
         if not agent.hyperparameters.keep_adapting:
             raise ValueError(f"The robots of {self.name} do not keep their networks; run them one by one.")
-        rows = torch.tensor([task.seed % SIDE_BY_SIDE for task in tasks])
+        rows = torch.tensor([task.seed % self.networks for task in tasks])
         state = agent._state_of(len(tasks))
         theta = {name: value[rows] for name, value in many.parameters_by_name().items()}
         belief = replace(state.belief, theta=theta, h=many.embeddings.detach()[rows, 0])
@@ -193,7 +193,7 @@ class MetaTrained:
         """The file of the agents of all replicates, which is made where it is not there."""
         path = task.cache / f"{task.robot}-{self.name}.zip"
         if not path.exists():
-            members = {} if _is_shipped(task.robot) else {"members": SIDE_BY_SIDE}
+            members = {} if _is_shipped(task.robot) else {"members": self.networks}
             data = _planned_data(task) if task.robot == "ant" and self.mode == "ours" else None
             self._new(task.robot, seed=0, **members).meta_learn(data, progress_bar=True, n_jobs=-1).save(path)
         return path
@@ -268,9 +268,14 @@ def _learn_ppo(task: Task) -> Path:
 
 
 def _meta_trained(
-    name: str, cls: type[ModelBasedAgent], mode: str = "ours", in_step: bool = False, **settings: Any
+    name: str,
+    cls: type[ModelBasedAgent],
+    mode: str = "ours",
+    networks: int = 10,
+    in_step: bool = False,
+    **settings: Any,
 ) -> Method:
-    recipe = MetaTrained(name, cls, mode, settings)
+    recipe = MetaTrained(name, cls, mode, networks, settings)
     return Method(recipe.agent, recipe.learn, recipe.fleet if in_step else None)
 
 
@@ -282,7 +287,7 @@ METHODS: dict[str, Method] = {
     "famle-nearest": Method(partial(famle, adapt_steps=0, compose=False, spread_members=False)),
     "famle-paper": _meta_trained("paper", FAMLE, "paper"),
     "famle-original": _meta_trained("original", FAMLE, "original"),
-    "ampc": _meta_trained("ampc", AMPC, in_step=True),
+    "ampc": _meta_trained("ampc", AMPC, networks=30, in_step=True),
     "ampc-reptile": _meta_trained("reptile", AMPCMAML, in_step=True, meta_learner="reptile"),
     "ampc-fomaml": _meta_trained("fomaml", AMPCMAML, in_step=True, meta_learner="first-order-maml"),
     "ampc-maml": _meta_trained("maml", AMPCMAML, in_step=True, meta_learner="maml"),
