@@ -194,7 +194,7 @@ class MetaTrained:
         path = task.cache / f"{task.robot}-{self.name}.zip"
         if not path.exists():
             members = {} if _is_shipped(task.robot) else {"members": self.networks}
-            data = _planned_data(task) if task.robot == "ant" and self.mode == "ours" else None
+            data = _simulated_data(task) if self.mode == "ours" else None
             self._new(task.robot, seed=0, **members).meta_learn(data, progress_bar=True, n_jobs=-1).save(path)
         return path
 
@@ -202,28 +202,22 @@ class MetaTrained:
         return self.cls(robot, self.mode, seed=seed, device="cpu", pretrained=False, **{**self.settings, **more})
 
 
-def _planned_data(task: Task) -> Transitions:
-    """As many transitions as FAMLE's model has seen: random ones, and ones of planning with that very model.
+def _simulated_data(task: Task) -> Transitions:
+    """As many transitions of each situation as FAMLE's model has seen, collected once for all methods.
 
-    FAMLE's own rounds begin with a poor model, which the rivals are spared.
+    Where FAMLE goes round, its planned transitions come from that very model: its own rounds began with a poor one,
+    which the rivals are spared.
     """
     path = task.cache / f"{task.robot}-transitions.npz"
     if not path.exists():
-        agent = famle(task)
-        settings, env = agent.hyperparameters, agent._require_env()
-        sources = situation_envs(env, None)
-        random = collect(
-            sources.sources,
-            sources.situations,
-            settings.transitions_per_situation,
-            make_held_uniform(settings.action_hold),
-            seed=0,
-            n_jobs=-1,
-        )
-        n = settings.rounds * settings.round_transitions
-        planned = collect(sources.sources, sources.situations, n, agent._planning(), seed=1, n_jobs=-1)
+        agent = FAMLE(task.robot, seed=0, device="cpu")
+        settings, transitions = agent.hyperparameters, agent.collect(progress_bar=True, n_jobs=-1)
+        if n := settings.rounds * settings.round_transitions:
+            envs = situation_envs(agent._require_env(), None)
+            planned = collect(envs.sources, envs.situations, n, agent._planning(), seed=1, n_jobs=-1)
+            transitions = transitions.followed_by(planned)
         path.parent.mkdir(parents=True, exist_ok=True)
-        random.followed_by(planned).save(path)
+        transitions.save(path)
     return Transitions.load(path)
 
 
