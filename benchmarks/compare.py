@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from benchmarks.harness import Fleet, Options, Replicate, Result, is_stored, run_replicates
+from benchmarks.harness import Fleet, Options, Replicate, ReplicateError, Result, is_stored, run_replicates
 from benchmarks.methods import METHODS, Method, Task
 
 __all__ = ["compare"]
@@ -34,10 +34,12 @@ def compare(
 
     Raises:
         ValueError: A method is unknown.
+        ReplicateError: A replicate failed; all others have run and are stored.
     """
     for method in methods:
         if method not in known:
             raise ValueError(f"There is no method {method!r}. Methods: {', '.join(known)}.")
+    failure: ReplicateError | None = None
     for method in methods:
         replicates: list[Replicate | Fleet]
         if run_fleet is not None and known[method].fleet is not None:
@@ -46,4 +48,9 @@ def compare(
             replicates = [Replicate(method, task.seed, partial(run, method, task)) for task in tasks]
         if not all(is_stored(some, folder) for some in replicates):
             known[method].learn(tasks[0])  # once, before the replicates want it in their processes
-        run_replicates(replicates, folder, options.jobs, options.backend)
+        try:
+            run_replicates(replicates, folder, options.jobs, options.backend)
+        except ReplicateError as error:
+            failure = failure or error
+    if failure is not None:
+        raise failure

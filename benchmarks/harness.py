@@ -7,6 +7,7 @@ import platform
 import subprocess
 import sys
 import time
+import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -22,6 +23,7 @@ __all__ = [
     "Fleet",
     "Options",
     "Replicate",
+    "ReplicateError",
     "Result",
     "is_stored",
     "load_results",
@@ -32,6 +34,10 @@ __all__ = [
 
 Result = dict[str, Any]
 _PACKAGES = ("famle", "gymnasium", "matplotlib", "numpy", "pybullet", "scipy", "stable-baselines3", "torch")
+
+
+class ReplicateError(RuntimeError):
+    """A replicate failed."""
 
 
 @dataclass(frozen=True)
@@ -101,25 +107,27 @@ def run_replicates(replicates: Iterable[Replicate | Fleet], folder: Path, jobs: 
         backend: Where they run.
 
     Raises:
-        Exception: What a replicate raised, after all others have run and are stored.
+        ReplicateError: A replicate failed; all others have run and are stored.
     """
     todo = [some for some in replicates if not is_stored(some, folder)]
+    if not todo:
+        return
     calls = (delayed(_run)(some) for some in todo)
-    failure: Exception | None = None
+    failure = ""
     with (
         parallel(backend),
         tqdm(total=sum(len(some.seeds) for some in todo), desc=str(folder), unit="replicate") as bar,
     ):
         for some, results in as_completed(calls, jobs):
-            if isinstance(results, Exception):
+            if isinstance(results, str):
                 failure = failure or results
             else:
                 for seed, result in zip(some.seeds, results, strict=True):
                     write_json(_path(folder, some.method, seed), result | provenance(sys.argv))
             bar.set_postfix_str(f"{some.method}-{some.seeds[-1]}")
             bar.update(len(some.seeds))
-    if failure is not None:
-        raise failure
+    if failure:
+        raise ReplicateError(f"A replicate failed; the others are stored.\n{failure}")
 
 
 def is_stored(some: Replicate | Fleet, folder: Path) -> bool:
@@ -161,24 +169,18 @@ def _path(folder: Path, method: str, seed: int) -> Path:
     return folder / f"{method}-{seed}.json"
 
 
-def _run(some: Replicate | Fleet) -> tuple[Replicate | Fleet, list[Result] | Exception]:
-    """The results, or what was raised instead: a replicate that fails must not end the others."""
+def _run(some: Replicate | Fleet) -> tuple[Replicate | Fleet, list[Result] | str]:
+    """The results, or the traceback of what was raised instead: one that fails must not end the others."""
     import torch
 
     torch.set_num_threads(1)  # replicates that run at the same time share the cores
     start = time.perf_counter()
     try:
-        results = some.results()
-    except Exception as error:
-        error.add_note(f"Raised by {some.method}, seed {some.seeds[0]}.")
-        return some, error
-    shared = {"wall_seconds": time.perf_counter() - start} | (
-        {} if len(some.seeds) == 1 else {"fleet": len(some.seeds)}
-    )
-    return some, [
-        {"method": some.method, "seed": seed, **result, **shared}
-        for seed, result in zip(some.seeds, results, strict=True)
-    ]
+        results = dict(zip(some.seeds, some.results(), strict=True))
+    except Exception:
+        return some, f"{some.method}, seed {some.seeds[0]}: {traceback.format_exc()}"
+    shared = {"wall_seconds": time.perf_counter() - start} | ({} if len(results) == 1 else {"fleet": len(results)})
+    return some, [{"method": some.method, "seed": seed, **result, **shared} for seed, result in results.items()]
 
 
 def _command(argv: list[str]) -> list[str]:

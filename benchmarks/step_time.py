@@ -3,8 +3,8 @@
 python -m benchmarks.step_time
 
 All methods take turns in one run on one thread. `famle-original` is measured inside an episode, without its adaptation
-at the end, which grows with the number of episodes. What a step costs does not depend on what the networks know, so that
-they are hardly trained. The raw cost is the robot's own step with random actions.
+at the end, which grows with the number of episodes. What a step costs does not depend on what the networks know, so
+that they are hardly trained. The raw cost is the robot's own step with random actions.
 """
 
 from __future__ import annotations

@@ -95,12 +95,12 @@ class ModelBasedAgent(SimulationLearner):
         )
         hooks.on_training_start(locals(), globals())
         loop, state = self._loop(), self._state_of(env.num_envs)
-        starts = torch.ones(env.num_envs, dtype=torch.bool, device=self.device)
+        starts = torch.as_tensor(self._last_episode_starts, dtype=torch.bool, device=self.device)
         while self.num_timesteps < total_timesteps:
             action, state = loop.act(state, self._tensor(self._last_obs), starts, self._generator)
             self._last_obs, _, dones, infos = env.step(self._to_env(action))  # type: ignore[assignment]
             self.num_timesteps += env.num_envs
-            starts = torch.as_tensor(dones, device=self.device)
+            self._last_episode_starts, starts = dones, torch.as_tensor(dones, device=self.device)
             state = self._live = loop.remember(state, self._tensor(self._last_obs), starts)
             self._update_info_buffer(infos, dones)
             hooks.update_locals(locals())
@@ -257,10 +257,12 @@ class ModelBasedAgent(SimulationLearner):
         low, high = (bound.repeat_interleave(model.members, dim=0) for bound in memory.range())
         return bounded(simulator, low, high)
 
-    def _sample(self) -> Sample:
-        """What a gradient step on the robot sees."""
-        size = self.hyperparameters.adapt_batch_size
-        return minibatches(size, self._generator) if size else whole_memory
+    def _sample(self, belief: Belief) -> Sample:
+        """What a gradient step on the robot sees; the same for the same belief, as a deterministic agent promises."""
+        if not (size := self.hyperparameters.adapt_batch_size):
+            return whole_memory
+        chance = torch.Generator(self.device).manual_seed(1_000_003 * (self.seed or 0) + belief.adaptations)
+        return minibatches(size, chance)
 
     def _state_of(self, robots: int) -> OnlineState:
         """What the agent believes now where that fits the number of robots, else what it meta-learned."""

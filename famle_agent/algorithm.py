@@ -115,7 +115,7 @@ class ModelBasedAlgorithm(BaseAlgorithm):
         self.hyperparameters = robot.hyperparameters(mode, self._method(overrides), **{**self._implied, **overrides})
         self._reward_fn = reward_fn
         if self.env is not None:
-            self._env_reward_fn = planning_reward(self.env, self._reward_names)
+            self._env_reward_fn = planning_reward(self.env, self.hyperparameters.planning_reward)
         self._learned_reward: LearnedReward | None = None
         self._dims = self._dims_of(angle_dims, quaternion_dims, pose_dims)
         self._generator = torch.Generator(self.device)
@@ -149,7 +149,7 @@ class ModelBasedAlgorithm(BaseAlgorithm):
         wrapped = self._wrap_env(env, self.verbose)
         check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
         self._describe_env(wrapped)
-        self._env_reward_fn = planning_reward(wrapped, self._reward_names)
+        self._env_reward_fn = planning_reward(wrapped, self.hyperparameters.planning_reward)
         self.n_envs = wrapped.num_envs
         super().set_env(wrapped, force_reset)
 

@@ -56,12 +56,12 @@ class _OneModelAgent(ModelBasedAgent):
         return belief
 
     def _adapt(self, memory: Memory, belief: Belief) -> Belief:
-        """Theta* = k gradient steps from theta_meta on the last M transitions (the paper's eq. 3)."""
+        """Theta* = k gradient steps on the last M transitions, from theta_meta (the paper's eq. 3) or going on."""
         settings = self.hyperparameters
         start = belief if settings.keep_adapting else self._prior(len(memory.weight))
         start = replace(start, adaptations=belief.adaptations + 1)
         steps = settings.adaptation(memory.seen)
-        return descend(self._require_dynamics(), start, memory, steps, settings.validation_size, self._sample())
+        return descend(self._require_dynamics(), start, memory, steps, settings.validation_size, self._sample(belief))
 
 
 class AMPC(_OneModelAgent):
@@ -96,9 +96,10 @@ class AMPC(_OneModelAgent):
 class AMPCMAML(_OneModelAgent):
     """Adaptive MPC whose model was meta-learned, as one starting point for all situations.
 
-    Every K steps it takes k gradient steps on the last M transitions, each time from the meta-learned theta. The
-    setting ``meta_learner`` says how that is learnt: ``"reptile"`` (Nichol et al., 2018; Algorithm 1 without
-    embeddings), ``"first-order-maml"`` or ``"maml"`` (Finn et al., 2017; the paper's eq. 3 to 5). Arguments as for
+    Every K steps it takes k gradient steps on the last M transitions, each time from the meta-learned theta (the
+    paper's) or, with the setting ``keep_adapting``, from where the last ones led. The setting ``meta_learner`` says how
+    theta is learnt: ``"reptile"`` (Nichol et al., 2018; Algorithm 1 without embeddings), ``"first-order-maml"`` or
+    ``"maml"`` (Finn et al., 2017; the paper's eq. 3 to 5). Arguments as for
     :class:`~famle_agent.algorithm.ModelBasedAlgorithm`.
 
     Example:

@@ -135,7 +135,7 @@ def load_agent(
     meta, tensors = read_checkpoint(file)
     if (kind := meta.get("class")) != cls.__name__:
         raise ValueError(
-            f"The file is no FAMLE checkpoint of a {cls.__name__} but of a {kind}; load it with {kind}.load()."
+            f"The file is no FAMLE checkpoint of {cls.__name__} but of {kind}; load it with {kind}.load()."
         )
     try:
         observation_space, action_space = (_box_from_json(meta[f"{name}_space"]) for name in ("observation", "action"))

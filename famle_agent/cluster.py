@@ -27,6 +27,7 @@ def parallel(backend: Backend = "loky") -> Iterator[None]:
             work.
 
     Raises:
+        ValueError: There is no such backend.
         ImportError: Ray is not installed.
         ConnectionError: There is no cluster at the address.
 
@@ -40,6 +41,8 @@ def parallel(backend: Backend = "loky") -> Iterator[None]:
         with parallel_config("loky"):
             yield
         return
+    if backend != "ray":
+        raise ValueError(f"There is no backend {backend!r}. Backends: loky, ray.")
     try:
         import ray
         from ray.util.joblib import register_ray

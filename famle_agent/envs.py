@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from famle_agent.hyperparameters import known_robots
 from famle_agent.planning import RewardFn
+from famle_agent.policies import REWARDS
 from famle_agent.transitions import EnvSource
 from famle_envs.reality import Profile
 from famle_envs.situation import Situation
@@ -191,8 +192,19 @@ def _check_simulated(made: gym.Env[Any, Any]) -> None:
         )
 
 
-def planning_reward(env: VecEnv, names: Sequence[str]) -> RewardFn | None:
-    """What a planner should maximise in an environment, where it says that; the first of the names that it has."""
+def planning_reward(env: VecEnv, name: str) -> RewardFn | None:
+    """What a planner should maximise in an environment, where it says that.
+
+    Args:
+        env: The environment.
+        name: What it calls it; empty takes the first of :data:`~famle_agent.policies.REWARDS` that it has.
+
+    Raises:
+        ValueError: It has nothing of that name.
+    """
+    if name and not env.has_attr(name):
+        raise ValueError(f"The environment has no {name!r}; planning_reward must name a function of it, or be empty.")
+    names = (name,) if name else REWARDS
     known: list[RewardFn] = [env_attribute(env, name, None) for name in names if env.has_attr(name)]
     return known[0] if known else None
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,6 +38,11 @@ class FAMLE(ModelBasedAgent):
     @property
     def _n_embeddings(self) -> int:
         return len(self.situations)
+
+    def _method(self, overrides: Mapping[str, Any]) -> str:
+        if overrides.get("meta_learner", "reptile") != "reptile":
+            raise ValueError("FAMLE meta-learns with Reptile; a meta_learner is for AMPCMAML, which has no embeddings.")
+        return ""
 
     def _learn_model(
         self, transitions: Transitions, round_: int, last: bool, on_iteration: Callable[[dict[str, float]], bool]
@@ -103,5 +109,5 @@ class FAMLE(ModelBasedAgent):
             belief,
             settings.validation_size,
             settings.spread_members,
-            self._sample(),
+            self._sample(belief),
         )

@@ -69,7 +69,8 @@ class Hyperparameters:
         memory_size: M, transitions that adaptation looks back on.
         adapt_optimizer: Optimiser of online adaptation; None takes ``inner_optimizer``.
         adapt_steps: k of online adaptation; None takes ``inner_steps``, 0 only selects an embedding.
-        adapt_epochs: Passes through the memory instead of ``adapt_steps``; 0 counts steps.
+        adapt_epochs: Passes through the memory instead of ``adapt_steps``, of several robots that of the one that has
+            seen most; 0 counts steps.
         adapt_batch_size: Transitions per step of online adaptation, drawn from the memory; 0 takes all, as the paper
             does.
         keep_adapting: Whether an agent without embeddings takes its gradient steps from the network that it has,
@@ -81,7 +82,8 @@ class Hyperparameters:
         spread_members: Whether the members of the ensemble start from situations that are sampled from the posterior,
             instead of all from the most likely one (the paper's).
         forget_at_reset: Whether a new episode empties the memory; damage outlasts an episode, so not by default.
-        clamp_predictions: Whether a plan may imagine no observation beyond the range of those in the memory.
+        clamp_predictions: Whether a plan may imagine no observation beyond the range of those in the memory, as soon as
+            a robot has adapted.
         planning_reward: Name of the environment's function that the planner maximises; empty takes its
             ``planning_reward_fn`` or ``reward_fn``.
         planner: ``"icem"``, ``"mppi"`` or ``"random_shooting"`` (the paper's).
@@ -163,6 +165,8 @@ class Hyperparameters:
             raise ValueError(f"hidden must name the width of at least one layer, got {self.hidden}.")
         if self.adapt_epochs and not self.adapt_batch_size:
             raise ValueError("adapt_epochs needs an adapt_batch_size; adapt_steps counts steps on the whole memory.")
+        if self.adapt_at_reset and self.forget_at_reset:
+            raise ValueError("adapt_at_reset learns from what forget_at_reset throws away; choose one of them.")
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(map(str, choices))}, got {getattr(self, name)!r}.")

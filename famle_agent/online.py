@@ -26,6 +26,7 @@ class OnlineState:
         last: The observation and the action of the last step, (B, obs_dim) and (B, action_dim); None where
             somebody else reports the transitions.
         steps: Steps on which at least one robot had a transition.
+        adapted_at: How many of them there were when the robots last adapted at the end of an episode.
     """
 
     memory: Memory
@@ -33,6 +34,7 @@ class OnlineState:
     plan: Tensor
     last: tuple[Tensor, Tensor] | None = None
     steps: int = 0
+    adapted_at: int = 0
 
     @property
     def robots(self) -> int:
@@ -133,8 +135,9 @@ class OnlineLoop:
         """Voids the plans of the robots in ``starts`` (B,); adapts or empties their memories where it was asked for."""
         kept = ~starts
         seen = starts & (state.memory.weight.sum(dim=1) > 0)
-        if self.adapt_at_reset and seen.any():
-            state = replace(state, belief=self.adapt(state.memory, state.belief).where(seen, state.belief))
+        if self.adapt_at_reset and seen.any() and state.steps > state.adapted_at:
+            belief = self.adapt(state.memory, state.belief).where(seen, state.belief)
+            state = replace(state, belief=belief, adapted_at=state.steps)
         if self.forget_at_reset:
             memory = replace(state.memory, weight=state.memory.weight * kept[:, None])
             state = replace(state, memory=memory, belief=state.belief.where(kept, self.prior(state.robots)))

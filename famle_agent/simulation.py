@@ -128,7 +128,7 @@ class SimulationLearner(ModelBasedAlgorithm):
     ) -> bool:
         """Learns the model, and the reward where it is not known; says whether no callback ended it."""
         settings, last, going_on = self.hyperparameters, round_ == rounds, True
-        total, before = settings.iterations(round_, last), self.num_timesteps
+        total, before, known = settings.iterations(round_, last), self.num_timesteps, self.dynamics
         name = "Meta-learning" + (f" {round_ + 1}/{rounds + 1}" if rounds else "")
         with tqdm(total=total - before, desc=name, mininterval=1.0, disable=not progress_bar) as bar:
 
@@ -141,8 +141,12 @@ class SimulationLearner(ModelBasedAlgorithm):
 
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(self._draw_seed())  # initial weights come from torch's global generator
-                self._learn_model(transitions, round_, last, on_iteration)
-                self._learn_reward(transitions)
+                try:
+                    self._learn_model(transitions, round_, last, on_iteration)
+                    self._learn_reward(transitions)
+                except BaseException:
+                    self.dynamics = known  # half-learnt models are none
+                    raise
         return going_on
 
     def collect(

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from famle_agent import FAMLE, Transitions
-from famle_agent.adaptation import Belief, Candidates, Memory, adapt, prior
-from famle_agent.dynamics import Dynamics
+from famle_agent.adaptation import Belief, Candidates, adapt, descend, prior, select, window_posterior
+from famle_agent.dynamics import Batch, Dynamics
 from famle_agent.inner_loop import InnerLoop
+from famle_agent.memory import Memory, minibatches, whole_memory
 from tests.helpers import adapted, memory_of
 
 INNER_LOOP = InnerLoop(steps=10, lr=1e-3, embedding_lr=0.05, optimizer="adam")
@@ -89,6 +90,83 @@ def test_adding_leaves_the_old_memory_as_it_is() -> None:
     assert memory.log_p.sum() == 0
 
 
+memories = st.integers(1, 4).flatmap(
+    lambda robots: st.lists(st.lists(st.booleans(), min_size=robots, max_size=robots), min_size=1, max_size=9)
+)
+"""Which robots have a transition at each step, for memories of 5."""
+
+
+def remembered(valid: list[list[bool]]) -> tuple[Memory, list[list[Tensor]]]:
+    """A memory of 5, and what stands in it: the observations of each robot's last transitions, (2, 3) each."""
+    torch.manual_seed(len(valid))
+    robots = len(valid[0])
+    memory, seen = Memory.empty(robots, 5, 3, 1, 2, CPU), [list[Tensor]() for _ in range(robots)]
+    for flags in valid:
+        obs, next_obs, action, log_p = (torch.randn(robots, size) for size in (3, 3, 1, 2))
+        memory = memory.add(obs, action, next_obs, log_p, torch.tensor(flags))
+        for robot in range(robots):
+            seen[robot] += [torch.stack([obs[robot], next_obs[robot]])] * flags[robot]
+    return memory, [rows[-5:] for rows in seen]
+
+
+@given(memories)
+def test_memory_knows_how_much_it_has_seen_and_how_far_it_went(valid: list[list[bool]]) -> None:
+    memory, seen = remembered(valid)
+    assert memory.seen == max(len(rows) for rows in seen)
+    low, high = memory.range()
+    for robot, rows in enumerate(seen):
+        if rows:
+            assert torch.equal(low[robot], torch.cat(rows).amin(dim=0))
+            assert torch.equal(high[robot], torch.cat(rows).amax(dim=0))
+        else:
+            assert (low[robot] == -torch.inf).all()
+            assert (high[robot] == torch.inf).all()
+
+
+# --- what a gradient step sees ----------------------------------------------------------------------------
+
+
+def numbered(weight: Tensor) -> Batch:
+    """Transitions that say which they are."""
+    x = torch.arange(weight.numel(), dtype=torch.float32).view(*weight.shape, 1)
+    return Batch(x, -x, weight)
+
+
+weights = st.lists(st.lists(st.booleans(), min_size=6, max_size=6), min_size=1, max_size=3)
+
+
+@given(weights, st.integers(1, 8), st.integers(0, 99))
+def test_minibatch_holds_what_counts_of_each_row(rows: list[list[bool]], size: int, seed: int) -> None:
+    data = numbered(torch.tensor(rows, dtype=torch.float32))
+    drawn = minibatches(size, torch.Generator().manual_seed(seed))(data)
+    assert drawn.x.shape == drawn.y.shape == (len(rows), size, 1)
+    assert torch.equal(drawn.y, -drawn.x)
+    for row, weight in enumerate(data.weight):
+        if weight.any():
+            assert (drawn.weight[row] == 1).all()
+            assert set(drawn.x[row].flatten().tolist()) <= set(data.x[row, weight == 1].flatten().tolist())
+        else:
+            assert (drawn.weight[row] == 0).all()  # nothing that could be learnt from
+
+
+@given(weights)
+def test_all_that_counts_is_drawn_as_often(rows: list[list[bool]]) -> None:
+    data = numbered(torch.tensor(rows, dtype=torch.float32))
+    drawn = minibatches(3000, torch.Generator().manual_seed(0))(data)
+    for row, weight in enumerate(data.weight):
+        counts = torch.bincount(drawn.x[row].flatten().long() - 6 * row, minlength=6) * drawn.weight[row].mean()
+        torch.testing.assert_close(counts, 3000 * weight / weight.sum().clamp(min=1), rtol=0.2, atol=0.0)
+
+
+def test_rows_and_steps_draw_by_themselves() -> None:
+    data, sample = numbered(torch.ones(2, 50)), minibatches(20, torch.Generator().manual_seed(0))
+    one, other = sample(data), sample(data)
+    assert not torch.equal(one.x[0], one.x[1] - 50)
+    assert not torch.equal(one.x, other.x)
+    assert torch.equal(minibatches(20, torch.Generator().manual_seed(0))(data).x, one.x)
+    assert whole_memory(data) is data
+
+
 # --- the most likely situation ----------------------------------------------------------------------------
 
 
@@ -132,6 +210,50 @@ def test_adaptation_starts_from_what_was_meta_learned(
     assert torch.equal(once.h, twice.h)
     assert all(torch.equal(value, twice.theta[name]) for name, value in once.theta.items())
     assert twice.adaptations == 2
+
+
+@pytest.mark.parametrize("spread", [False, True])
+@pytest.mark.parametrize("validation_size", [0, 10])
+def test_adaptation_is_selection_and_descent(
+    model: Dynamics, candidates: Candidates, held_out: Transitions, validation_size: int, spread: bool
+) -> None:
+    memory, start = memory_of(model, candidates, *tensors_of(held_out)), prior(model, candidates, 11)
+    belief = replace(start, log_posterior=window_posterior(candidates, memory))
+
+    def sample() -> Callable[[Batch], Batch]:
+        return minibatches(8, torch.Generator().manual_seed(1))
+
+    whole = adapt(model, candidates, memory, INNER_LOOP, belief, validation_size, spread, sample())
+    selected = select(model, candidates, belief, spread)
+    parts = descend(model, selected, memory, INNER_LOOP, validation_size, sample())
+    assert torch.equal(whole.h, parts.h)
+    assert all(torch.equal(value, parts.theta[name]) for name, value in whole.theta.items())
+    assert whole.adaptations == selected.adaptations == parts.adaptations == belief.adaptations + 1
+    likely = model.embeddings[0, belief.posterior.argmax(dim=1)].detach()
+    assert torch.allclose(selected.h, likely, atol=1e-5) or spread
+    assert all(torch.equal(value, start.theta[name]) for name, value in selected.theta.items())
+    assert not torch.equal(whole.h, selected.h)
+
+
+def test_descent_goes_on_from_where_a_belief_is(model: Dynamics, candidates: Candidates, held_out: Transitions) -> None:
+    memory, plain = memory_of(model, candidates, *tensors_of(held_out)), replace(INNER_LOOP, optimizer="sgd")
+    start = prior(model, candidates, 11)
+    once = descend(model, start, memory, plain)
+    twice = descend(model, once, memory, plain)
+    both = descend(model, start, memory, replace(plain, steps=20))
+    torch.testing.assert_close(twice.h, both.h)
+    torch.testing.assert_close(twice.theta, both.theta)
+    assert descend(model, once, memory, replace(plain, steps=0)) is once
+    assert twice.adaptations == start.adaptations  # who adapts counts
+
+
+def test_descent_that_diverges_stays_where_it_was(
+    model: Dynamics, candidates: Candidates, held_out: Transitions
+) -> None:
+    memory, start = memory_of(model, candidates, *tensors_of(held_out)), prior(model, candidates, 11)
+    adrift = descend(model, start, memory, InnerLoop(steps=50, lr=1e6, embedding_lr=1e6))
+    assert adrift.is_finite().all()
+    assert torch.equal(adrift.h, start.h)
 
 
 def test_empty_memory_says_nothing(model: Dynamics, candidates: Candidates) -> None:

@@ -1,4 +1,5 @@
 import json
+import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -6,12 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from joblib import delayed, parallel_config
 
 from benchmarks import reacher
-from benchmarks.harness import Replicate, load_results, run_replicates
+from benchmarks.harness import Fleet, Replicate, ReplicateError, is_stored, load_results, run_replicates
 from benchmarks.identification import accuracy, across_the_wrap
 from benchmarks.report import by_method, first_crossing, interquartile_mean, plot_curves, solved_at, summary
 from famle_agent import FAMLE, Transitions
+from famle_agent.cluster import as_completed, parallel
 from famle_envs.reacher import ReacherEnv
 
 
@@ -37,11 +40,89 @@ def test_finished_replicates_are_stored_and_not_run_again(tmp_path: Path) -> Non
     assert {"command", "commit", "versions", "wall_seconds", "method"} <= results[0].keys()
 
 
-def test_failing_replicate_loses_nothing_that_was_finished(tmp_path: Path) -> None:
-    with pytest.raises(ArithmeticError):
-        run_replicates(replicates(3, tmp_path / "log"), tmp_path / "out", jobs=1)
-    assert [result["seed"] for result in load_results(tmp_path / "out")] == [0, 1]
+def test_failing_replicate_ends_no_other(tmp_path: Path) -> None:
+    """It is named, and raises when all others are stored."""
+    with pytest.raises(ReplicateError, match=r"method, seed 2: (.|\n)*ArithmeticError: a replicate fails"):
+        run_replicates(replicates(4, tmp_path / "log"), tmp_path / "out", jobs=1)
+    assert [result["seed"] for result in load_results(tmp_path / "out")] == [0, 1, 3]
     assert not list((tmp_path / "out").glob("*.partial"))
+
+
+def test_fleet_is_stored_by_replicate_and_runs_as_a_whole(tmp_path: Path) -> None:
+    runs = []
+
+    def results(seeds: tuple[int, ...]) -> list[dict[str, Any]]:
+        runs.append(seeds)
+        return [{"value": 10 * seed} for seed in seeds]
+
+    fleet, more = (Fleet("method", seeds, partial(results, seeds)) for seeds in ((0, 3), (0, 3, 5)))
+    assert not is_stored(fleet, tmp_path)
+    for some in (fleet, fleet, more):
+        run_replicates([some], tmp_path, jobs=1)
+        assert is_stored(some, tmp_path)
+    assert runs == [(0, 3), (0, 3, 5)]
+    stored = load_results(tmp_path)
+    assert [(result["seed"], result["value"], result["fleet"]) for result in stored] == [
+        (0, 0, 3),
+        (3, 30, 3),
+        (5, 50, 3),
+    ]
+    single = Replicate("method", 3, partial(squared, 3, tmp_path / "log"))
+    run_replicates([single], tmp_path, jobs=1)
+    assert is_stored(single, tmp_path)
+    assert not (tmp_path / "log").exists()
+
+
+def test_fleet_that_forgets_a_replicate_is_not_stored(tmp_path: Path) -> None:
+    with pytest.raises(ReplicateError, match="shorter"):
+        run_replicates([Fleet("method", (0, 1), lambda: [{"value": 0}])], tmp_path, jobs=1)
+    assert not list(tmp_path.iterdir())
+
+
+# --- where work runs ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_number_of_processes_does_not_matter() -> None:
+    digests = []
+    for jobs in (1, 2):
+        agent = FAMLE("reacher", seed=0, device="cpu", transitions_per_situation=5)
+        with parallel("loky"):
+            digests.append(agent.collect(n_jobs=jobs).digest())
+        agent.get_env().close()
+    assert digests[0] == digests[1]
+
+
+@pytest.mark.parametrize("backend", ["loky", "sequential"])
+def test_all_results_come(backend: str) -> None:
+    with parallel_config(backend):
+        calls = (delayed(abs)(-i) for i in range(5))
+        assert sorted(as_completed(calls, n_jobs=1)) == [0, 1, 2, 3, 4]
+        assert list(as_completed([], n_jobs=1)) == []
+
+
+@pytest.mark.parametrize("missing", ["ray", "ray.util.joblib"])
+def test_missing_ray_is_named_with_its_remedy(missing: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, missing, None)  # as if it were not installed
+    with pytest.raises(ImportError, match=r'pip install "famle\[ray\]"'), parallel("ray"):
+        pass
+    with pytest.raises(ImportError, match="Ray is not installed"):
+        run_replicates(replicates(1, tmp_path / "log"), tmp_path / "out", jobs=1, backend="ray")
+    assert not (tmp_path / "log").exists()
+
+
+def test_unknown_backend_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ValueError, match="loky, ray"), parallel("dask"):  # type: ignore[arg-type]
+        pass
+
+
+def test_stored_results_need_no_cluster(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    run_replicates([], tmp_path, jobs=1, backend="ray")
+
+
+# --- reports ------------------------------------------------------------------------------------------------
 
 
 def test_missing_results_are_named(tmp_path: Path) -> None:

@@ -76,7 +76,8 @@ def test_rollouts_of_candidates_are_independent(model: Dynamics, size: int) -> N
     theta, h = random_theta(model, size), random_h(model, size)
     obs, action, _ = random_transitions(model, size * model.members, 5)
     simulator = model.simulator(theta, h)
-    torch.testing.assert_close(simulator(obs, action)[:, 2:3], simulator(obs[:, 2:3], action[:, 2:3]))
+    one, all_ = simulator(obs[:, 2:3], action[:, 2:3]), simulator(obs, action)
+    torch.testing.assert_close(all_[:, 2:3], one, rtol=1e-4, atol=1e-4)
 
 
 # --- members of an ensemble -------------------------------------------------------------------------------
@@ -115,21 +116,31 @@ def test_members_are_independent_networks() -> None:
 
 
 @given(models(), st.data())
-def test_part_of_an_ensemble_is_its_first_members(model: Dynamics, data: st.DataObject) -> None:
+def test_part_of_an_ensemble_is_some_of_its_members(model: Dynamics, data: st.DataObject) -> None:
     count = data.draw(st.integers(1, model.members))
-    part = model.with_members(count)
+    first = data.draw(st.integers(0, model.members - count))
+    part, chosen = model.with_members(count, first), slice(first, first + count)
     assert part.members == count
     h, batch = torch.randn(count, model.embeddings.shape[-1]), model.encode(*random_transitions(model, count, 4))
-    whole = expand(rows_of(model.parameters_by_name(), slice(0, count)), 1)
+    whole = rows_of(model.parameters_by_name(), chosen)
     torch.testing.assert_close(part.loss(part.parameters_by_name(), h, batch), model.loss(whole, h, batch))
-    assert torch.equal(part.embeddings, model.embeddings[:count])
-    assert torch.equal(part.noise_std, model.noise_std[:count])
+    assert torch.equal(part.embeddings, model.embeddings[chosen])
+    assert torch.equal(part.noise_std, model.noise_std[chosen])
     with torch.no_grad():
         part.embeddings.add_(1.0)
-    assert not torch.equal(part.embeddings, model.embeddings[:count])
-    for wrong in (0, model.members + 1):
-        with pytest.raises(ValueError, match=f"1 to {model.members} members"):
-            model.with_members(wrong)
+    assert not torch.equal(part.embeddings, model.embeddings[chosen])
+    for wrong, start in ((0, 0), (model.members + 1, 0), (1, model.members), (1, -1), (model.members, 1)):
+        with pytest.raises(ValueError, match=f"1 to {model.members} members to give, not {wrong} from {start} on"):
+            model.with_members(wrong, start)
+
+
+@given(models(), st.lists(st.integers(0, 3), min_size=1, max_size=6))
+def test_single_embedding_is_that_of_all_situations(model: Dynamics, situations: list[int]) -> None:
+    c = torch.tensor(situations) % max(model.n_situations, 4 * (model.n_situations == 1))
+    index = model.embedding_index(c)
+    assert index.tolist() == (c.tolist() if model.n_situations > 1 else [0] * len(c))
+    expected = model.embeddings.detach()[:, index].transpose(0, 1).flatten(0, 1)
+    assert torch.equal(model.embeddings_of(c), expected)
 
 
 def test_embeddings_of_situations_are_ordered_by_robot() -> None:

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -8,14 +10,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from famle_agent import FAMLE, Hyperparameters
+from famle_agent import AMPC, AMPCMAML, FAMLE, Hyperparameters
 from famle_agent.hyperparameters import known_robots, robot_of
+from famle_agent.inner_loop import InnerLoop
 from famle_agent.joint_training import JointTraining
+from famle_agent.maml import MAML
 from famle_agent.planning import ICEM, MPPI, RandomShooting
 
 MODES = ("ours", "paper")
 every_robot = pytest.mark.parametrize("robot", list(known_robots()))
 every_mode = pytest.mark.parametrize("mode", MODES)
+RIVALS: dict[str, tuple[Any, dict[str, Any]]] = {
+    "ampc": (AMPC, {}),
+    "reptile": (AMPCMAML, {}),
+    "first-order-maml": (AMPCMAML, {"meta_learner": "first-order-maml"}),
+    "maml": (AMPCMAML, {"meta_learner": "maml"}),
+}
+every_rival = pytest.mark.parametrize("rival", RIVALS)
 
 
 @every_robot
@@ -103,6 +114,10 @@ def test_joint_training_gets_its_settings() -> None:
         ({"joint_iterations": 1}, False),
         ({"inner_steps": 1, "horizon": 3}, False),
         ({"transitions_per_situation": 1}, False),
+        ({"keep_adapting": True, "adapt_at_reset": True, "clamp_predictions": True, "planning_reward": "r"}, True),
+        ({"adapt_epochs": 2, "adapt_batch_size": 8, "adapt_optimizer": "sgd"}, True),
+        ({"meta_learner": "maml"}, False),
+        ({"query_size": 3}, False),
     ],
 )
 def test_settings_of_the_life_on_a_robot_do_not_matter_for_what_was_learnt(change: dict[str, Any], alike: bool) -> None:
@@ -115,6 +130,82 @@ def test_adaptation_inherits_what_is_not_said_otherwise() -> None:
     assert settings.adaptation(seen=100) == settings.inner_loop()
     own = Hyperparameters(adapt_steps=0, adapt_lr=0.0, adapt_embedding_lr=0.5).adaptation(seen=100)
     assert (own.steps, own.lr, own.embedding_lr) == (0, 0.0, 0.5)
+
+
+@given(st.integers(0, 5000), st.integers(1, 300), st.integers(1, 50))
+def test_epochs_pass_as_often_through_what_was_seen(seen: int, batch_size: int, epochs: int) -> None:
+    settings = Hyperparameters(adapt_epochs=epochs, adapt_batch_size=batch_size, adapt_steps=7)
+    assert settings.adaptation(seen).steps == epochs * math.ceil(seen / batch_size)
+    assert Hyperparameters(adapt_batch_size=batch_size, adapt_steps=7).adaptation(seen).steps == 7
+
+
+def test_epochs_of_the_whole_memory_are_refused() -> None:
+    with pytest.raises(ValueError, match="adapt_epochs needs an adapt_batch_size; adapt_steps counts steps"):
+        Hyperparameters(adapt_epochs=1)
+
+
+def test_adaptation_has_an_optimiser_of_its_own() -> None:
+    settings = Hyperparameters(inner_optimizer="sgd", adapt_optimizer="adam", adapt_lr=0.5, adapt_embedding_lr=0.25)
+    assert settings.adaptation(seen=1) == InnerLoop(settings.inner_steps, 0.5, 0.25, "adam")
+    assert (
+        settings.inner_loop().optimizer == Hyperparameters(inner_optimizer="sgd").adaptation(seen=1).optimizer == "sgd"
+    )
+
+
+@pytest.mark.parametrize("first_order", [False, True])
+def test_maml_gets_its_settings(first_order: bool) -> None:
+    name = "first-order-maml" if first_order else "maml"
+    sizes = {"meta_batch_size": 3, "batch_size": 4, "query_size": 5}
+    made = Hyperparameters(meta_learner=name, meta_iterations=7, meta_lr=0.1, **sizes).maml()
+    assert made == MAML(iterations=7, meta_lr=0.1, **sizes, first_order=first_order)
+
+
+# --- rivals without embeddings ----------------------------------------------------------------------------
+
+
+def settings_of(rival: str, env: gym.Env[Any, Any], mode: str = "ours", **overrides: Any) -> Hyperparameters:
+    """Those of a rival's agent."""
+    cls, own = RIVALS[rival]
+    settings: Hyperparameters = cls(env, mode, device="cpu", pretrained=False, **own, **overrides).hyperparameters
+    return settings
+
+
+@every_rival
+@pytest.mark.parametrize("mode", [*MODES, "original"])
+def test_rivals_have_no_embeddings_in_any_mode(make_env: Callable[..., Any], rival: str, mode: str) -> None:
+    settings = settings_of(rival, make_env(), mode)
+    assert (settings.embedding_dim, settings.interaction_rank, settings.hazard) == (1, 0, 0)
+    assert {settings.gate_actions, settings.compose, settings.spread_members} == {False}
+    assert settings.embedding_lr == settings.joint_embedding_lr == settings.adaptation(seen=5).embedding_lr == 0
+    if rival == "ampc":
+        assert settings.rounds == settings.joint_iterations == settings.meta_iterations == 0
+    if mode != "ours":
+        assert settings.keep_adapting == (rival == "ampc")
+
+
+@pytest.mark.parametrize("robot", [name for name, robot in known_robots().items() if robot.rivals])
+def test_rivals_have_settings_of_their_own_in_one_mode(make_env: Callable[..., Any], robot: str) -> None:
+    entry = known_robots()[robot]
+    env = make_env(entry.env_id or "Pendulum-v1")
+    assert FAMLE(env, device="cpu", pretrained=False).hyperparameters == entry.hyperparameters("ours")
+    assert set(entry.rivals) == set(RIVALS)
+    for rival, (cls, own) in RIVALS.items():
+        tuned = entry.rivals[rival]
+        assert tuned
+        assert {name: getattr(settings_of(rival, env), name) for name in tuned} == tuned
+        assert settings_of(rival, env, "paper") == entry.hyperparameters("paper", **{**cls._implied, **own})
+        defaults = {name: getattr(Hyperparameters(), name) for name in tuned}
+        assert {name: getattr(settings_of(rival, env, **defaults), name) for name in tuned} == defaults
+
+
+def test_meta_learners_of_an_unknown_environment_have_settings(make_env: Callable[..., Any]) -> None:
+    for rival in ("first-order-maml", "maml"):
+        assert settings_of(rival, make_env("Pendulum-v1")).inner_loop().optimizer == "sgd"
+
+
+def test_meta_learner_of_a_rival_is_refused_by_the_others(make_env: Callable[..., Any]) -> None:
+    with pytest.raises((TypeError, ValueError), match="meta_learner"):
+        FAMLE(make_env(), device="cpu", meta_learner="maml")
 
 
 @given(
@@ -136,6 +227,13 @@ def test_adaptation_inherits_what_is_not_said_otherwise() -> None:
             "degrees_of_freedom": st.floats(0, 30) | st.integers(0, 30),
             "joint_iterations": st.integers(0, 9),
             "compose": st.booleans(),
+            "meta_learner": st.sampled_from(["reptile", "first-order-maml", "maml"]),
+            "query_size": st.integers(1, 100),
+            "adapt_optimizer": st.sampled_from([None, "sgd", "adam"]),
+            "adapt_at_reset": st.booleans(),
+            "keep_adapting": st.booleans(),
+            "clamp_predictions": st.booleans(),
+            "planning_reward": st.text(max_size=5),
         },
     )
 )
@@ -190,6 +288,12 @@ def test_unknown_setting_names_the_one_that_was_meant(name: str, suggestion: str
         ("joint_embedding_lr", -1e-3),
         ("joint_batch_size", 0),
         ("meta_iterations", -1),
+        ("meta_learner", "mamml"),
+        ("meta_learner", None),
+        ("query_size", 0),
+        ("adapt_epochs", -1),
+        ("adapt_batch_size", -1),
+        ("adapt_optimizer", "lion"),
     ],
 )
 def test_value_out_of_range_is_refused(name: str, value: Any) -> None:

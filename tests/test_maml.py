@@ -22,9 +22,9 @@ def situations(n: int, seed: int) -> Batch:
     return Batch(x, a * x + b + 2 * torch.sin(2 * x), torch.ones(n, 20))
 
 
-def fresh_model(n_situations: int = 1) -> Dynamics:
+def fresh_model(n_situations: int = 1, members: int = 1) -> Dynamics:
     torch.manual_seed(0)
-    return Dynamics(1, 0, n_situations, embedding_dim=2, hidden=(16,), gate_actions=False)
+    return Dynamics(1, 0, n_situations, embedding_dim=2, hidden=(16,), gate_actions=False, members=members)
 
 
 def meta_learn(maml: MAML, seed: int = 0) -> Dynamics:
@@ -129,3 +129,68 @@ def test_embedding_stays_and_the_callback_ends_it() -> None:
 def test_misuse_says_what_to_do(inner_loop: InnerLoop, n_situations: int, maml: MAML, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         maml(fresh_model(n_situations), situations(4, seed=1), inner_loop, torch.Generator())
+
+
+# --- ensembles ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("first_order", [False, True])
+def test_each_member_descends_the_gradient_that_it_would_have_alone(first_order: bool) -> None:
+    """Of situations with one transition each, so that it does not matter which are drawn."""
+    data = situations(4, seed=3)
+    data = Batch(*(value[:, :1].expand_as(value).double() for value in (data.x, data.y, data.weight)))
+    still = replace(SETTINGS, iterations=1, meta_lr=0.0, max_grad_norm=1e9, first_order=first_order)
+    ensemble = fresh_model(members=3).double()
+    for model in (ensemble, *(alone := [ensemble.with_members(1, member) for member in range(3)])):
+        still(model, data, INNER_LOOP, torch.Generator())
+    for member in range(3):
+        for name, value in ensemble.theta.items():
+            torch.testing.assert_close(value.grad[member], alone[member].theta[name].grad[0])
+
+
+def test_members_learn_as_independent_networks_do() -> None:
+    """Whatever the others are: with the same minibatches, a member ends where it would have ended beside others."""
+    few, data = replace(SETTINGS, iterations=5), situations(40, seed=1)
+    ensembles = [fresh_model(members=3) for _ in range(2)]
+    with torch.no_grad():
+        for value in ensembles[1].theta.values():
+            value[1].mul_(3.0)
+    for model in ensembles:
+        few(model, data, INNER_LOOP, torch.Generator().manual_seed(0))
+    for name, value in ensembles[0].theta.items():
+        torch.testing.assert_close(value[[0, 2]], ensembles[1].theta[name][[0, 2]])
+        assert not torch.allclose(value[1], ensembles[1].theta[name][1])
+
+
+def test_members_of_an_ensemble_are_as_good_as_one_network() -> None:
+    """As many networks, from as many starting points and of as many minibatches."""
+    before, model, data = fresh_model(members=3), fresh_model(members=3), situations(40, seed=1)
+    SETTINGS(model, data, INNER_LOOP, torch.Generator().manual_seed(0))
+    alone = loss_after_adaptation(meta_learn(SETTINGS), seed=2)
+    for member in range(3):
+        after, start = (loss_after_adaptation(one.with_members(1, member), seed=2) for one in (model, before))
+        assert after < 0.8 * start
+        assert after < 1.3 * alone
+    for name, value in model.theta.items():
+        assert not torch.equal(value[0], value[1]), name
+
+
+def test_gradient_of_each_member_is_shortened_by_itself() -> None:
+    model = fresh_model(members=3)
+    lengths = torch.tensor([0.5, 2.0, 30.0])
+    count = sum(value[0].numel() for value in model.theta.values())
+    for value in model.theta.values():
+        value.grad = (lengths / count**0.5).view(-1, *[1] * (value.ndim - 1)).expand_as(value).clone()
+    before = {name: value.grad.clone() for name, value in model.theta.items()}
+    replace(SETTINGS, max_grad_norm=1.0)._shorten_gradients(model)
+    for member, factor in enumerate((1.0, 1 / 2, 1 / 30)):
+        for name, value in model.theta.items():
+            torch.testing.assert_close(value.grad[member], factor * before[name][member], rtol=1e-4, atol=0.0)
+
+
+@pytest.mark.parametrize("first_order", [False, True])
+@pytest.mark.parametrize("members", [1, 2])
+def test_divergence_says_what_to_do(first_order: bool, members: int) -> None:
+    wild, maml = replace(INNER_LOOP, lr=1e6, steps=5), replace(SETTINGS, first_order=first_order)
+    with pytest.raises(ValueError, match=r"diverged in iteration \d+; take a smaller inner_lr or meta_lr"):
+        maml(fresh_model(members=members), situations(4, seed=1), wild, torch.Generator().manual_seed(0))

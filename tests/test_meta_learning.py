@@ -1,18 +1,24 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import pytest
 import torch
 
+from famle_agent import AMPCMAML, NotLearnedError
 from famle_agent.dynamics import Batch, Dynamics, expand
 from famle_agent.inner_loop import InnerLoop
+from famle_agent.joint_training import JointTraining
+from famle_agent.maml import MAML
 from famle_agent.meta_learning import MetaStep, Reptile
 
 INNER_LOOP = InnerLoop(steps=4, lr=0.05, embedding_lr=0.2)
 
 
-def fresh_model(members: int = 1) -> Dynamics:
+def fresh_model(members: int = 1, n_situations: int = 4) -> Dynamics:
     torch.manual_seed(0)
-    return Dynamics(1, 1, n_situations=4, embedding_dim=2, hidden=(16,), members=members)
+    return Dynamics(1, 1, n_situations, embedding_dim=2, hidden=(16,), members=members)
 
 
 def situations() -> Batch:
@@ -140,3 +146,76 @@ def test_callback_ends_it() -> None:
     reptile = Reptile(iterations=50, meta_lr=0.5, embedding_meta_lr=0.5, meta_batch_size=2, batch_size=8)
     reptile(model, situations(), INNER_LOOP, torch.Generator().manual_seed(0), callback)
     assert steps == [1, 2, 3]
+
+
+# --- one embedding for many situations ----------------------------------------------------------------------
+
+
+THETA_ALONE = InnerLoop(steps=4, lr=0.05, embedding_lr=0.0)
+
+
+def follow_reptile(model: Dynamics, data: Batch) -> None:
+    learn = Reptile(iterations=60, meta_lr=1.0, embedding_meta_lr=1.0, meta_batch_size=2, batch_size=16)
+    learn(model, data, INNER_LOOP, torch.Generator().manual_seed(0))
+
+
+def follow_maml(model: Dynamics, data: Batch) -> None:
+    learn = MAML(iterations=60, meta_lr=0.01, meta_batch_size=2, batch_size=16, query_size=16)
+    learn(model, data, THETA_ALONE, torch.Generator().manual_seed(0))
+
+
+def train_jointly(model: Dynamics, data: Batch) -> None:
+    JointTraining(60, lr=0.01, embedding_lr=0.0, batch_size=32)(model, data, torch.Generator().manual_seed(0))
+
+
+every_learner = pytest.mark.parametrize("learn", [follow_reptile, follow_maml, train_jointly])
+
+
+def losses(model: Dynamics, data: Batch) -> torch.Tensor:
+    """The loss of each situation's data in each member, (N, P)."""
+    N, P = len(data.x), model.members
+    rows = Batch(*(values.repeat_interleave(P, dim=0) for values in (data.x, data.y, data.weight)))
+    theta, h = expand(model.parameters_by_name(), N), model.embeddings_of(torch.arange(N))
+    return model.loss(theta, h, rows).view(N, P)
+
+
+@every_learner
+@pytest.mark.parametrize("members", [1, 2])
+def test_one_embedding_stays_and_the_network_learns_all_situations(
+    learn: Callable[[Dynamics, Batch], None], members: int
+) -> None:
+    model, before, data = fresh_model(members, 1), fresh_model(members, 1), situations()
+    learn(model, data)
+    assert torch.equal(model.embeddings, before.embeddings)
+    assert (losses(model, data).mean(dim=0) < 0.8 * losses(before, data).mean(dim=0)).all()
+
+
+def test_reptile_with_one_embedding_moves_towards_the_mean_of_the_adapted_networks() -> None:
+    """Nichol et al., 2018: theta += alpha_meta mean(theta~ - theta)."""
+    model, data = fresh_model(1, 1), situations()
+    theta, h = model.parameters_by_name(), model.embeddings_of(torch.arange(4))
+    theta = {name: value.clone() for name, value in theta.items()}
+    alike = Batch(data.x[:, :1], data.y[:, :1], data.weight[:, :1])  # there is but one minibatch to draw
+    adapted, _, _ = THETA_ALONE(model, expand(theta, 4), h, lambda: alike)
+    Reptile(1, 0.3, 0.7, 4, batch_size=1)(model, alike, THETA_ALONE, torch.Generator())
+    for name, value in model.parameters_by_name().items():
+        torch.testing.assert_close(value, theta[name] + 0.3 * (adapted[name] - theta[name]).mean(dim=0, keepdim=True))
+
+
+@pytest.mark.parametrize("members", [1, 3])
+def test_noise_of_one_embedding_is_that_of_all_situations(members: int) -> None:
+    model, data = fresh_model(members, 1), situations()
+    model.fit_noise(data)
+    theta, c = expand(model.parameters_by_name(), 4), torch.arange(4)
+    x = data.x.repeat_interleave(members, dim=0)
+    errors = model.predict(theta, model.embeddings_of(c)[:, None], x) - data.y.repeat_interleave(members, dim=0)
+    variance = errors.square().mean(dim=1).view(4, members, -1).mean(dim=0)
+    torch.testing.assert_close(model.noise_std.square(), variance, rtol=1e-4, atol=1e-6)
+
+
+def test_agent_whose_learning_failed_has_no_model(make_env: Callable[..., Any]) -> None:
+    agent = AMPCMAML(make_env(), meta_learner="maml", device="cpu", transitions_per_situation=5, hidden=(4,))
+    with pytest.raises(ValueError, match="different transitions of each situation"):
+        agent.meta_learn(["intact"])
+    with pytest.raises(NotLearnedError):
+        agent.posterior()

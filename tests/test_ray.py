@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import ray
 
-from benchmarks.harness import Fleet, Replicate, load_results, run_replicates
+from benchmarks.harness import Fleet, Replicate, ReplicateError, load_results, run_replicates
 from famle_agent import FAMLE
 from famle_agent.cluster import parallel
 
@@ -53,7 +53,7 @@ def test_two_workers_collect_what_one_process_does(cluster: None) -> None:
 
 def test_two_workers_store_what_one_process_does_and_lose_nothing(cluster: None, tmp_path: Path) -> None:
     for backend, jobs in (("loky", 1), ("ray", 2)):
-        with pytest.raises(ArithmeticError, match="a replicate fails"):
+        with pytest.raises(ReplicateError, match="ArithmeticError: a replicate fails"):
             run_replicates(replicates(), tmp_path / backend, jobs, backend)  # type: ignore[arg-type]
     assert values(tmp_path / "ray") == values(tmp_path / "loky")
     assert os.getpid() not in {result["process"] for result in load_results(tmp_path / "ray")}
