@@ -4,56 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.figure import Figure
 from rich.table import Table
-from scipy import stats
 
 from benchmarks.harness import Result
+from benchmarks.statistics import first_crossing, interquartile_mean, median_steps, quartiles, solved_at
 from famle_agent.plots import style
 
 __all__ = ["by_method", "first_crossing", "interquartile_mean", "plot_curves", "quartiles", "solved_at", "summary"]
-
-Array = npt.NDArray[np.float64]
-
-
-def solved_at(returns: Sequence[float], lengths: Sequence[int], threshold: float) -> int | None:
-    """Robot steps at the end of the first episode from which three in a row are above the threshold."""
-    above = np.asarray(returns) > threshold
-    for i in range(len(above) - 2):
-        if above[i : i + 3].all():
-            return int(np.sum(lengths[: i + 1]))
-    return None
-
-
-def first_crossing(returns: Sequence[float], lengths: Sequence[int], threshold: float) -> int | None:
-    """Robot steps at the end of the first episode above the threshold."""
-    above = np.flatnonzero(np.asarray(returns) > threshold)
-    return int(np.sum(lengths[: above[0] + 1])) if len(above) else None
-
-
-def interquartile_mean(values: Sequence[float] | Array) -> tuple[float, float, float]:
-    """The mean of the middle half and its 95 % bootstrap interval."""
-    data = np.asarray(values, dtype=np.float64)
-    mean = float(stats.trim_mean(data, 0.25))
-    if len(data) < 2 or np.ptp(data) == 0.0:
-        return mean, mean, mean
-    interval = stats.bootstrap(
-        (data,),
-        lambda x, axis: stats.trim_mean(x, 0.25, axis=axis),
-        n_resamples=2000,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    return mean, float(interval.low), float(interval.high)
-
-
-def quartiles(values: Any) -> Array:
-    """The 25th, 50th and 75th percentile over the first axis."""
-    return np.percentile(np.asarray(values, dtype=np.float64), [25, 50, 75], axis=0)
 
 
 def by_method(results: Sequence[Result]) -> Mapping[str, list[Result]]:
@@ -110,6 +70,5 @@ def _spread(values: Sequence[float]) -> str:
 
 
 def _median_steps(steps: Sequence[int | None]) -> str:
-    """The median, where a replicate that never got there counts as infinite."""
-    median = float(np.median([np.inf if step is None else step for step in steps]))
+    median = median_steps(steps)
     return f"{median:.0f}" if np.isfinite(median) else "never"

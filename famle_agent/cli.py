@@ -12,6 +12,8 @@ import torch
 import tyro
 from rich.console import Console
 
+from benchmarks.harness import ReplicateError
+from benchmarks.reporting import Report
 from benchmarks.suite import Benchmark
 from famle_agent.demo import run_demo, run_episode
 from famle_agent.errors import NotLearnedError
@@ -117,7 +119,7 @@ def main(args: list[str] | None = None) -> None:
         args: The command line without the program's name; None takes the process's own.
     """
     command = tyro.extras.subcommand_cli_from_dict(
-        {"demo": Demo, "meta-learn": MetaLearn, "run": Run, "benchmark": Benchmark},
+        {"demo": Demo, "meta-learn": MetaLearn, "run": Run, "benchmark": Benchmark, "report": Report},
         args=args,
         prog="famle",
     )
@@ -126,6 +128,6 @@ def main(args: list[str] | None = None) -> None:
         torch.set_num_threads(1)
     try:
         command()
-    except (ValueError, TypeError, OSError, NotLearnedError) as error:
+    except (ImportError, OSError, NotLearnedError, ReplicateError, TypeError, ValueError) as error:
         Console(stderr=True).print(f"famle: {error}", markup=False, highlight=False)
         sys.exit(2)

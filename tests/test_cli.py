@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -101,6 +102,8 @@ def test_meta_learning_goes_on_in_its_folder(tmp_path: Path, capsys: pytest.Capt
         (["demo", "--situation", "[/joint 3 dead]"], "[/joint 3 dead]"),
         (["run", "nothing.zip"], "nothing.zip"),
         (["run", "."], "directory"),
+        (["benchmark", "reacher", "--methods", "magic"], "no method 'magic'"),
+        (["report"], "holds no results; run a benchmark first"),
     ],
 )
 def test_mistakes_end_with_advice(
@@ -146,5 +149,18 @@ def test_help_names_the_commands(capsys: pytest.CaptureFixture[str]) -> None:
         main(["--help"])
     assert caught.value.code == 0
     shown = capsys.readouterr().out
-    for command in ("demo", "meta-learn", "run"):
+    for command in ("demo", "meta-learn", "run", "benchmark", "report"):
         assert command in shown
+
+
+def test_benchmark_and_report_from_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    small = ["--replicates", "1", "--ppo-steps", "200", "--jobs", "1"]
+    main(["benchmark", "reacher", "--methods", "ppo", *small])
+    stored = json.loads((tmp_path / "benchmarks/results/reacher-paper/ppo-0.json").read_text())
+    assert stored["lengths"] == [50] * 4
+    main(["report"])
+    assert "PPO" in (tmp_path / "benchmarks/report/report.md").read_text()
+    assert "report.md" in capsys.readouterr().out

@@ -1,0 +1,87 @@
+"""The report's first table, all robots in one, which the README shows."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.looks import in_order, look
+from benchmarks.study import Study
+from benchmarks.tables import Row, figures
+
+__all__ = ["headline", "insert"]
+
+METHODS = (
+    *("famle", "famle-paper", "famle-original", "ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml"),
+    *("ppo", "ppo-pretrained", "oracle"),
+)
+"""What the table has rows for, where it was measured."""
+
+
+def _median(row: Row) -> str:
+    key = next(name.removesuffix("_median") for name in row if name.endswith("_median"))
+    low, median, high = (row[f"{key}_{name}"] for name in ("low", "median", "high"))
+    decimals = 0 if abs(median) >= 100 else 1
+    return f"{median:.{decimals}f} ({low:.{decimals}f} to {high:.{decimals}f})"
+
+
+def _solved(row: Row) -> str:
+    return "never" if np.isinf(row["solved_at"]) else f"{row['solved_at']:,.0f}"
+
+
+def _gaits(row: Row) -> str:
+    mean = row["steps_mean"]
+    return f"{100 * row['success']:.0f} %" + ("" if mean is None else f", {mean:.1f} +- {row['steps_deviation']:.1f}")
+
+
+COLUMNS: Sequence[tuple[str, str, Callable[[Row], str]]] = (
+    ("reacher-paper", "arm: return of the first 50 steps", _median),
+    ("reacher-paper", "arm: solved after robot steps", _solved),
+    ("ant-curves", "ant: return of the first 1,000 steps", _median),
+    ("ant-curves", "ant: solved after robot steps", _solved),
+    ("quadruped-yaw", "quadruped, yaw error: success, gaits", _gaits),
+    ("quadruped-leg", "... a leg blocked", _gaits),
+    ("quadruped-both", "... both", _gaits),
+    ("minitaur-reality", "Minitaur: metres in 60 gaits", _median),
+)
+"""The experiment, the heading and the cell of each column; experiments without results have none."""
+
+_BLOCK = re.compile(r"(<!-- report -->\n).*?(<!-- end of report -->)", re.DOTALL)
+
+
+def headline(studies: Sequence[Study]) -> str:
+    """The table in Markdown: a row a method, a column an experiment."""
+    rows = {study.experiment.folder: {row["method"]: row for row in figures(study)} for study in studies}
+    columns = [column for column in COLUMNS if column[0] in rows]
+    methods = in_order({method for folder, *_ in columns for method in rows[folder]} & set(METHODS))
+    table = [["method", *(title for _, title, _ in columns)], ["---"] * (len(columns) + 1)]
+    for method in methods:
+        cells = [cell(rows[folder][method]) if method in rows[folder] else "" for folder, _, cell in columns]
+        table.append([look(method).label, *cells])
+    counts = {folder: _replicates(rows[folder]) for folder, *_ in columns}
+    lines = [f"| {' | '.join(line)} |" for line in table]
+    return "\n".join([*lines, "", f"Replicates: {', '.join(f'{n} ({folder})' for folder, n in counts.items())}."])
+
+
+def _replicates(rows: Mapping[str, Row]) -> str:
+    counts = [row["replicates"] for method, row in rows.items() if method in METHODS]
+    return f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else str(counts[0])
+
+
+def insert(table: str, readme: Path) -> None:
+    """Puts the table between the marks of a text, in place of what stood there.
+
+    Raises:
+        ValueError: The text has no marks.
+    """
+    text = readme.read_text()
+    if not _BLOCK.search(text):
+        raise ValueError(
+            f"{readme} has no place for the table: a line <!-- report -->, and one <!-- end of report -->."
+        )
+    partial = readme.with_name(f"{readme.name}.partial")
+    partial.write_text(_BLOCK.sub(lambda marks: f"{marks[1]}{table}\n{marks[2]}", text))
+    partial.replace(readme)

@@ -1,0 +1,253 @@
+"""The report's text: a section an experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+
+from benchmarks.looks import look
+from benchmarks.registry import Experiment, Kind
+from benchmarks.study import Study
+from benchmarks.tables import Row
+
+__all__ = ["document", "section"]
+
+Column = tuple[str, Callable[[Row], str]]
+"""The heading of a column, and what it says of a row."""
+
+
+def document(
+    sections: Sequence[str], missing: Sequence[Experiment], unknown: Sequence[str], times: Sequence[str]
+) -> str:
+    """The whole report.
+
+    Args:
+        sections: One an experiment.
+        missing: Experiments without results.
+        unknown: Folders of results that are no entry of the registry.
+        times: Names of the files of pictures of returns against time.
+    """
+    parts = ["# Results", *_HOW_TO_READ, *sections]
+    if times:
+        parts += [
+            "## Return against time",
+            *(f"![Return against the time of a control step]({name})" for name in times),
+            "Interquartile means; times in one run where there are any, else those of the replicates.",
+        ]
+    if missing:
+        rows = "\n".join(f"| {one.title} | `{one.folder}` | `{one.command}` |" for one in missing)
+        parts += ["## Not measured", f"| experiment | folder | command |\n| --- | --- | --- |\n{rows}"]
+    if unknown:
+        names = ", ".join(f"`{name}`" for name in unknown)
+        parts += ["## Stored and not shown", f"These folders have no entry in `benchmarks/registry.py`: {names}."]
+    return "\n\n".join(parts) + "\n"
+
+
+def section(study: Study, rows: Sequence[Row], pictures: Sequence[str]) -> str:
+    """The section of an experiment.
+
+    Args:
+        study: Its replicates.
+        rows: Its figures.
+        pictures: Names of the files of its pictures, none where another section shows them.
+    """
+    experiment = study.experiment
+    measured = [row for row in rows if row["replicates"]]
+    parts = [f"## {study.title}", *(f"![{experiment.title}]({picture})" for picture in pictures)]
+    parts.append(_table([_METHOD, _N, *_COLUMNS[experiment.kind](study), *_paper(study)], rows))
+    parts.append(_NOTES[experiment.kind].format(study=study))
+    parts.append(_table([_METHOD, _N, *_measures(study)], measured))
+    if compared := [row for row in measured if f"{study.measures[0].key}_famle_better" in row]:
+        parts += [_table([_METHOD, _N, *_improvements(study)], compared), _better_than_famle(study, compared)]
+    return "\n\n".join([*parts, _sources(study)])
+
+
+_HOW_TO_READ = (
+    """Made by `famle report` from stored results alone. Robot steps are counted from the damage on. Spreads are medians
+with quartiles in round brackets; IQM is the interquartile mean with its bootstrap 95 % interval in square brackets.
+*Of the oracle* is the ratio of IQMs over the seeds that both have, turned over where fewer is better, so that 100 % is
+as good as the oracle; in brackets stands how many seeds that is, where a method has more. *P(FAMLE better)* is the
+probability that a replicate of FAMLE does better than one of the other method, a tie counted half, with its bootstrap
+95 % interval; where a method has one replicate the interval is all of [0, 1].""",
+    """Times of replicates are wall times on machines that did other work too, and none are given of replicates that ran
+in step as one batch; those *in one run*, where methods took turns (`python -m benchmarks.step_time`), can be compared.
+The paper's figures for the quadruped and the Minitaur are of other bodies; they stand beside ours and not against
+them.""",
+)
+
+_NOTES: Mapping[Kind, str] = {
+    "curves": """Solved: three returns in a row above {study.experiment.threshold:g}, counted at the end of the first of
+them; a replicate that never gets there is infinite in the median. Methods are compared over the first {study.steps:,}
+robot steps, which all replicates have; *solved at* and *first crossing* are over all steps of a method. The time of a
+step contains the simulated robot and all learning on the way.""",
+    "episode": "The time is the median of a control step, with adaptation.",
+    "gaits": """Steps are the gaits of the runs that reach the goal, within {study.experiment.budget}. A gait takes a
+second; the paper's took about two. The time of a plan is without adaptation.""",
+    "distance": """The largest distance and the seconds until then, medians over replicates of {study.experiment.budget}
+gaits, a second each. The time of a plan is without adaptation.""",
+}
+"""How the first table of each kind is to be read."""
+
+
+# --- columns ----------------------------------------------------------------------------------------------------------
+
+_METHOD: Column = ("method", lambda row: str(row["label"]))
+_N: Column = ("n", lambda row: str(row["replicates"] or "-"))
+
+
+def _curves(study: Study) -> list[Column]:
+    return [
+        ("robot steps", lambda row: _steps(row.get("robot_steps"))),
+        (f"solved in {study.steps:,}", lambda row: _count(row, "solved_in_common_steps")),
+        ("solved at all", lambda row: _count(row, "solved")),
+        ("solved at", lambda row: _steps(row.get("solved_at"))),
+        ("first crossing", lambda row: _steps(row.get("first_crossing"))),
+        ("FAMLE faster by", lambda row: _percent(row.get("famle_faster_by"))),
+        ("2nd episode", lambda row: _number(row.get("second_episode_median"))),
+        *_times(study),
+    ]
+
+
+def _times(study: Study) -> list[Column]:
+    columns: list[Column] = [("ms / step", lambda row: _number(row.get("ms")))]
+    if study.step_times:
+        columns.append(("ms / step in one run (times the robot alone)", _together))
+    return columns
+
+
+def _episode(study: Study) -> list[Column]:
+    return [
+        (f"above {study.experiment.threshold:g}", lambda row: _count(row, "solved")),
+        *_times(study),
+    ]
+
+
+def _gaits(study: Study) -> list[Column]:
+    return [
+        ("steps, mean +- deviation", lambda row: _deviation(row, "steps")),
+        ("success rate", lambda row: _percent(row.get("success"))),
+        ("ms / plan", lambda row: _number(row.get("ms"))),
+    ]
+
+
+def _distance(study: Study) -> list[Column]:
+    return [
+        ("max distance (m)", lambda row: _number(row.get("furthest_median"))),
+        ("interaction time (s)", lambda row: _steps(row.get("furthest_after_median"))),
+        ("falls", lambda row: _count(row, "falls")),
+        ("ms / plan", lambda row: _number(row.get("ms"))),
+    ]
+
+
+_COLUMNS: Mapping[Kind, Callable[[Study], list[Column]]] = {
+    "curves": _curves,
+    "episode": _episode,
+    "gaits": _gaits,
+    "distance": _distance,
+}
+"""The first table of each kind, as the paper's."""
+
+
+def _paper(study: Study) -> list[Column]:
+    return [("the paper", lambda row: row.get("paper", "-"))] if study.experiment.paper else []
+
+
+def _measures(study: Study) -> list[Column]:
+    columns = list[Column]()
+    for measure in study.measures:
+        key = measure.key
+        columns += [
+            (f"{measure.label}: median (quartiles)", partial(_spread, key=key)),
+            ("IQM [95 %]", partial(_interval, key=key)),
+        ]
+        if "oracle" in study.runs:
+            columns.append(("of the oracle", partial(_of_oracle, key=key)))
+    return columns
+
+
+def _improvements(study: Study) -> list[Column]:
+    return [(f"P(FAMLE better), {measure.label}", partial(_better, key=measure.key)) for measure in study.measures]
+
+
+# --- cells ------------------------------------------------------------------------------------------------------------
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"
+
+
+def _steps(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return "never" if np.isinf(value) else f"{value:,.0f}"
+
+
+def _percent(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return "never solved" if np.isinf(value) else f"{100 * value:,.0f} %"
+
+
+def _count(row: Row, key: str) -> str:
+    return f"{row[key]} of {row['replicates']}" if key in row else "-"
+
+
+def _deviation(row: Row, key: str) -> str:
+    mean, deviation = row.get(f"{key}_mean"), row.get(f"{key}_deviation")
+    return "-" if mean is None or deviation is None else f"{mean:.1f} +- {deviation:.1f}"
+
+
+def _together(row: Row) -> str:
+    return f"{row['step_ms']:.1f} (x {row['times_robot_alone']:.1f})" if "step_ms" in row else "-"
+
+
+def _spread(row: Row, key: str) -> str:
+    return "{} ({} to {})".format(*(_decimals(row, key, name) for name in ("median", "low", "high")))
+
+
+def _interval(row: Row, key: str) -> str:
+    return "{} [{}, {}]".format(*(_decimals(row, key, name) for name in ("iqm", "iqm_low", "iqm_high")))
+
+
+def _of_oracle(row: Row, key: str) -> str:
+    seeds = row.get(f"{key}_oracle_seeds")
+    return _percent(row.get(f"{key}_of_oracle")) + (f" ({seeds})" if seeds not in (None, row["replicates"]) else "")
+
+
+def _better(row: Row, key: str) -> str:
+    return "{:.2f} [{:.2f}, {:.2f}]".format(*(row[f"{key}_famle_better{suffix}"] for suffix in ("", "_low", "_high")))
+
+
+def _decimals(row: Row, key: str, name: str) -> str:
+    """A figure with as many decimals as the others of its cell."""
+    return f"{row[f'{key}_{name}']:.{0 if abs(row[f'{key}_median']) >= 100 else 1}f}"
+
+
+# --- parts ------------------------------------------------------------------------------------------------------------
+
+
+def _table(columns: Sequence[Column], rows: Sequence[Row]) -> str:
+    lines = [[title for title, _ in columns], ["---"] * len(columns)]
+    lines += [[cell(row) for _, cell in columns] for row in rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _better_than_famle(study: Study, rows: Sequence[Row]) -> str:
+    """Who wins against FAMLE in what, so that nobody has to search for it."""
+    wins = []
+    for measure in study.measures:
+        winners = [row["label"] for row in rows if row[f"{measure.key}_famle_better_high"] < 0.5]
+        if winners:
+            wins.append(f"{' / '.join(winners)} ({measure.label})")
+    return f"Better than FAMLE, the whole interval below one half: {'; '.join(wins) or 'none'}."
+
+
+def _sources(study: Study) -> str:
+    """What makes the results, and what made each of them."""
+    lines = [f"`{study.experiment.command}` makes the results. {study.experiment.shared} These were made by:", ""]
+    for (commit, command), methods in study.provenance.items():
+        names = ", ".join(look(method).label + f" (`{method}`)" for method in methods)
+        lines.append(f"- `{command}` at `{commit}`: {names}")
+    return "\n".join(lines)

@@ -1,0 +1,107 @@
+"""``famle report``: tables, pictures and TensorBoard from stored results alone; nothing is run again."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from benchmarks.comparison_board import write_board
+from benchmarks.headline import headline, insert
+from benchmarks.markdown import document, section
+from benchmarks.pictures import draw, draw_times
+from benchmarks.registry import EXPERIMENTS, Experiment
+from benchmarks.study import Study, read_study
+from benchmarks.tables import figures, replicates, to_csv
+
+__all__ = ["Report"]
+
+
+@dataclass(frozen=True)
+class Report:
+    """Report on all stored results: report.md with tables and pictures, and every figure as CSV."""
+
+    results: Path = Path("benchmarks/results")
+    """Folder of the stored results."""
+    out: Path = Path("benchmarks/report")
+    """Folder of the report."""
+    tensorboard: Path | None = None
+    """Folder for TensorBoard, where methods can be laid over each other; by default there is none."""
+    readme: Path | None = None
+    """A text whose block between the marks of the report gets the table of all robots."""
+
+    def __call__(self) -> None:
+        """Reads, counts, draws, and then writes.
+
+        Raises:
+            FileNotFoundError: There are no results.
+            ValueError: A stored result is damaged, or the text has no marks.
+        """
+        found = {experiment: read_study(experiment, self.results) for experiment in EXPERIMENTS}
+        studies = [study for study in found.values() if study is not None]
+        if not studies:
+            raise FileNotFoundError(
+                f"{self.results} holds no results; run a benchmark first, such as: {EXPERIMENTS[0].command}"
+            )
+        missing = [experiment for experiment, study in found.items() if study is None]
+        for name, content in {**_pictures(studies), **_texts(studies, missing, self._unknown())}.items():
+            _write(self.out / name, content)
+        if self.readme is not None:
+            insert(headline(studies), self.readme)
+        if self.tensorboard is not None:
+            write_board(studies, self.tensorboard)
+        Console().print(f"{self.out / 'report.md'}: {len(studies)} of {len(EXPERIMENTS)} experiments.")
+
+    def _unknown(self) -> list[str]:
+        """Folders of results that are no entry of the registry."""
+        known = {experiment.folder for experiment in EXPERIMENTS}
+        return sorted({path.parent.name for path in self.results.glob("*/*-*.json")} - known)
+
+
+def _texts(studies: Sequence[Study], missing: Sequence[Experiment], unknown: Sequence[str]) -> dict[str, bytes]:
+    """The report and its tables by the names of their files."""
+    texts, sections, drawn = dict[str, str](), list[str](), set[str]()
+    for study in studies:
+        rows, picture = figures(study), study.experiment.picture_name
+        texts[f"{study.experiment.folder}.csv"] = to_csv(rows)
+        sections.append(section(study, rows, [] if picture in drawn else [f"{picture}.png"]))
+        drawn.add(picture)
+    texts["replicates.csv"] = to_csv([row for study in studies for row in replicates(study)])
+    texts["report.md"] = document(
+        [f"## All robots\n\n{headline(studies)}", *sections],
+        missing,
+        unknown,
+        ["time.png"] if _with_returns(studies) else [],
+    )
+    return {name: text.encode() for name, text in texts.items()}
+
+
+def _pictures(studies: Sequence[Study]) -> dict[str, bytes]:
+    """The pictures by the names of their files."""
+    groups: dict[str, list[Study]] = {}
+    for study in studies:
+        groups.setdefault(study.experiment.picture_name, []).append(study)
+    pictures = {f"{name}.png": _png(draw(group)) for name, group in groups.items()}
+    return pictures | ({"time.png": _png(draw_times(shown))} if (shown := _with_returns(studies)) else {})
+
+
+def _with_returns(studies: Sequence[Study]) -> list[Study]:
+    return [study for study in studies if study.experiment.kind in ("curves", "episode")]
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=150)
+    return buffer.getvalue()
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Writes a file that is either whole or not there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.name}.partial")
+    partial.write_bytes(content)
+    partial.replace(path)

@@ -1,0 +1,97 @@
+"""What is said of a group of replicates, and of one group beside another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+__all__ = [
+    "Array",
+    "first_crossing",
+    "interquartile_mean",
+    "median_steps",
+    "probability_of_improvement",
+    "quartiles",
+    "solved_at",
+]
+
+Array = npt.NDArray[np.float64]
+
+_RESAMPLES = 2000
+
+
+def solved_at(returns: Sequence[float], lengths: Sequence[int], threshold: float) -> int | None:
+    """Robot steps at the end of the first episode from which three in a row are above the threshold."""
+    above = np.asarray(returns) > threshold
+    for i in range(len(above) - 2):
+        if above[i : i + 3].all():
+            return int(np.sum(lengths[: i + 1]))
+    return None
+
+
+def first_crossing(returns: Sequence[float], lengths: Sequence[int], threshold: float) -> int | None:
+    """Robot steps at the end of the first episode above the threshold."""
+    above = np.flatnonzero(np.asarray(returns) > threshold)
+    return int(np.sum(lengths[: above[0] + 1])) if len(above) else None
+
+
+def median_steps(steps: Sequence[int | None]) -> float:
+    """The median of robot steps; a replicate that never got there, None, counts as infinite."""
+    return float(np.median([np.inf if step is None else step for step in steps]))
+
+
+def quartiles(values: Any) -> Array:
+    """The 25th, 50th and 75th percentile over the first axis."""
+    return np.percentile(np.asarray(values, dtype=np.float64), [25, 50, 75], axis=0)
+
+
+def interquartile_mean(values: Sequence[float] | Array) -> tuple[float, float, float]:
+    """The mean of the middle half and its 95 % bootstrap interval."""
+    data = np.asarray(values, dtype=np.float64)
+    mean = float(stats.trim_mean(data, 0.25))
+    if len(data) < 2 or np.ptp(data) == 0.0:
+        return mean, mean, mean
+    interval = stats.bootstrap(
+        (data,),
+        lambda x, axis: stats.trim_mean(x, 0.25, axis=axis),
+        n_resamples=_RESAMPLES,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return mean, float(interval.low), float(interval.high)
+
+
+def probability_of_improvement(x: Sequence[float] | Array, y: Sequence[float] | Array) -> tuple[float, float, float]:
+    """P(X > Y), a tie counted half, and its 95 % bootstrap interval.
+
+    Both groups are resampled, each for itself. One replicate says nothing of how replicates differ: the interval is
+    then all of [0, 1].
+
+    Args:
+        x: A figure of each replicate of one group, (n,).
+        y: The same figure of the other group's, (m,).
+
+    Raises:
+        ValueError: A group is empty.
+    """
+    groups = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    if not all(len(group) for group in groups):
+        raise ValueError("Both groups need a replicate to be compared.")
+    p = float(_wins(*groups))
+    if min(len(group) for group in groups) < 2:
+        return p, 0.0, 1.0
+    interval = stats.bootstrap(
+        groups, _wins, n_resamples=_RESAMPLES, method="percentile", rng=np.random.default_rng(0)
+    ).confidence_interval
+    return p, float(interval.low), float(interval.high)
+
+
+def _wins(x: Array, y: Array, axis: int = -1) -> Any:
+    """The Mann-Whitney statistic as a fraction of all pairs; no p-value is wanted, hence the cheapest method."""
+    with np.errstate(all="ignore"):  # where all values are tied there is no p-value
+        statistic = stats.mannwhitneyu(x, y, axis=axis, method="asymptotic").statistic
+    return statistic / (x.shape[axis] * y.shape[axis])

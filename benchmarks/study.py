@@ -1,0 +1,221 @@
+"""The stored replicates of one experiment, and the figures that are read from each."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.harness import Result
+from benchmarks.looks import in_order, look
+from benchmarks.registry import Experiment, Kind
+from benchmarks.report import by_method
+from benchmarks.statistics import Array, quartiles
+
+__all__ = ["ROBOT_ALONE", "Measure", "Study", "quartiles_over_steps", "read_study"]
+
+ROBOT_ALONE = "robot alone"
+"""The raw cost of a control step among the times that were measured in one run."""
+
+_NEEDED: Mapping[Kind, tuple[str, ...]] = {
+    "curves": ("returns", "lengths", "seconds_per_step"),
+    "episode": ("return", "speed", "ms_per_step"),
+    "gaits": ("gaits", "reached", "path", "ms_per_plan"),
+    "distance": ("gaits", "distance", "fell", "path", "ms_per_plan"),
+}
+"""What a stored replicate must have."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A figure by which methods are compared.
+
+    Attributes:
+        key: Its name in tables for machines.
+        label: Its name for people.
+        score: The figure of a stored replicate.
+        higher_is_better: Whether more is better.
+    """
+
+    key: str
+    label: str
+    score: Callable[[Result], float]
+    higher_is_better: bool = True
+
+
+@dataclass(frozen=True)
+class Study:
+    """The stored replicates of one experiment.
+
+    Attributes:
+        experiment: What was done.
+        runs: The replicates of each method by seed, methods in the order in which they are shown.
+        step_times: Milliseconds of a control step by method, all measured in one run; empty where nobody did.
+    """
+
+    experiment: Experiment
+    runs: Mapping[str, Sequence[Result]]
+    step_times: Mapping[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def steps(self) -> int:
+        """The robot steps that all replicates of all methods have in whole episodes; of learning curves alone."""
+        return min(sum(run["lengths"]) for runs in self.runs.values() for run in runs)
+
+    @cached_property
+    def measures(self) -> tuple[Measure, ...]:
+        """What the methods are compared by, the first one first."""
+        limit = self.experiment.budget
+        if self.experiment.kind == "curves":
+            return (
+                Measure("first_episode", "return of the first episode", lambda run: float(run["returns"][0])),
+                Measure("mean_return", f"mean return over {self.steps:,} robot steps", self._mean_return),
+                Measure("last_episode", f"return of the episode at {self.steps:,} robot steps", self._last_return),
+            )
+        if self.experiment.kind == "episode":
+            return (Measure("return", "return of the first episode", lambda run: float(run["return"])),)
+        if self.experiment.kind == "gaits":
+            label = f"gaits to the goal, {limit + 1} where it is not reached"
+            return (Measure("gaits", label, lambda run: float(run["gaits"] if run["reached"] else limit + 1), False),)
+        return (Measure("distance", "distance (m)", lambda run: float(run["distance"])),)
+
+    def scores(self, method: str, measure: Measure) -> Array:
+        """A figure of each replicate of a method, (n,)."""
+        return np.array([measure.score(run) for run in self.runs[method]])
+
+    def of_oracle(self, method: str, measure: Measure) -> tuple[Array, Array] | None:
+        """A figure of a method and of the oracle over the seeds that both have, each (n,); None without such seeds."""
+        ours, oracle = ({run["seed"]: run for run in self.runs.get(name, ())} for name in (method, "oracle"))
+        if not (shared := ours.keys() & oracle.keys()):
+            return None
+        first, second = (np.array([measure.score(runs[seed]) for seed in sorted(shared)]) for runs in (ours, oracle))
+        return first, second
+
+    def milliseconds(self, run: Result) -> float | None:
+        """Wall time of a replicate's control step: the mean with all learning in learning curves, else the median.
+
+        Replicates that ran in step, as one batch, have none of their own.
+        """
+        if run.get("fleet", 1) > 1:
+            return None
+        if self.experiment.kind == "curves":
+            return 1000.0 * float(run["seconds_per_step"])
+        return float(run["ms_per_step"]["median"] if self.experiment.kind == "episode" else run["ms_per_plan"])
+
+    def own_time(self, method: str) -> float | None:
+        """The median of the replicates' own milliseconds, None where they have none."""
+        own = [value for run in self.runs[method] if (value := self.milliseconds(run)) is not None]
+        return float(np.median(own)) if own else None
+
+    @cached_property
+    def times(self) -> Mapping[str, float]:
+        """Milliseconds of a control step of the methods that have any: in one run where that was measured."""
+        time_of = self.step_times.get if self.step_times else self.own_time
+        return {method: time for method in self.runs if (time := time_of(method)) is not None}
+
+    def trace(self, run: Result) -> tuple[Array, Array]:
+        """What happened over a replicate's life: robot steps or actions, and return, speed or x at each, both (n,)."""
+        kind = self.experiment.kind
+        if kind == "curves":
+            return np.cumsum(run["lengths"]).astype(np.float64), np.array(run["returns"], dtype=np.float64)
+        if kind == "episode":
+            speed = np.array(run["speed"], dtype=np.float64)
+            return np.linspace(0.0, self.experiment.budget, len(speed) + 1)[1:], speed
+        x = np.array(run["path"], dtype=np.float64)[:, 0]
+        return np.arange(len(x), dtype=np.float64), x
+
+    @cached_property
+    def title(self) -> str:
+        """The experiment's title; less than was asked for, or than others have, says so in it."""
+        counts = {method: len(runs) for method, runs in self.runs.items()}
+        most = max(counts.values())
+        parts = [f"{most} replicates"]
+        if most < self.experiment.paper_replicates:
+            parts[0] += f", the paper has {self.experiment.paper_replicates}"
+        for fewer in sorted({n for n in counts.values() if n < most}, reverse=True):
+            parts.append(f"{fewer} of " + " / ".join(look(method).label for method, n in counts.items() if n == fewer))
+        if self.experiment.kind == "curves":
+            longest = max(max(run["lengths"]) for runs in self.runs.values() for run in runs)
+            if self.steps + longest <= self.experiment.budget:
+                parts.append(f"{self.steps:,} robot steps instead of {self.experiment.budget:,}")
+        return f"{self.experiment.title}: {'; '.join(parts)}"
+
+    @property
+    def provenance(self) -> Mapping[tuple[str, str], Sequence[str]]:
+        """The methods that come from each commit and command."""
+        sources: dict[tuple[str, str], list[str]] = {}
+        for method, runs in self.runs.items():
+            for source in sorted({(run["commit"], run["command"]) for run in runs}):
+                sources.setdefault(source, []).append(method)
+        return sources
+
+    def _mean_return(self, run: Result) -> float:
+        """The mean return over the steps that all have, each episode weighted by its steps within them."""
+        ends = np.minimum(np.cumsum(run["lengths"]), self.steps)
+        return float(np.average(run["returns"], weights=np.diff(ends, prepend=0)))
+
+    def _last_return(self, run: Result) -> float:
+        """The return of the episode that the last step which all have belongs to."""
+        return float(run["returns"][np.searchsorted(np.cumsum(run["lengths"]), self.steps)])
+
+
+def quartiles_over_steps(traces: Sequence[tuple[Array, Array]], hold: bool = False) -> tuple[Array, Array]:
+    """The quartiles over replicates at each robot step at which one of them has a value.
+
+    A replicate's value at a step is that of the episode, or the action, which the step belongs to.
+
+    Args:
+        traces: Robot steps and values of each replicate.
+        hold: Whether a replicate that ended keeps its last value; else nothing is said of steps that not all have.
+
+    Returns:
+        Robot steps (n,), and the 25th, 50th and 75th percentile at each, (3, n).
+    """
+    ends = [steps[-1] for steps, _ in traces]
+    grid = np.unique(np.concatenate([steps for steps, _ in traces]))
+    grid = grid[grid <= (max(ends) if hold else min(ends))]
+    values = [value[np.minimum(np.searchsorted(steps, grid), len(value) - 1)] for steps, value in traces]
+    return grid, quartiles(values)
+
+
+def read_study(experiment: Experiment, results: Path) -> Study | None:
+    """The stored replicates of an experiment, or None where there are none.
+
+    Args:
+        experiment: What was done.
+        results: The folder of all results.
+
+    Raises:
+        ValueError: A file is damaged.
+    """
+    files = sorted((results / experiment.folder).glob("*-*.json"))
+    stored = [_read(path, ("method", "seed", *_NEEDED[experiment.kind])) for path in files]
+    methods = by_method(sorted(stored, key=lambda run: int(run["seed"])))
+    runs = {method: methods[method] for method in in_order(methods)}
+    return Study(experiment, runs, _step_times(experiment, results)) if runs else None
+
+
+def _step_times(experiment: Experiment, results: Path) -> Mapping[str, float]:
+    """What `benchmarks.step_time` has stored of a robot; the other kinds of experiments count plans and not steps."""
+    path = results / "step-time.json"
+    if experiment.kind not in ("curves", "episode") or not path.exists():
+        return {}
+    turns: Mapping[str, Sequence[float]] = _read(path, ("times",))["times"].get(experiment.robot, {})
+    return {method: float(np.median(milliseconds)) for method, milliseconds in turns.items()}
+
+
+def _read(path: Path, needed: Sequence[str]) -> Result:
+    remedy = "delete the file and run the benchmark again; it skips all that is stored."
+    try:
+        result = json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged ({error}): {remedy}") from error
+    if not isinstance(result, dict):
+        raise ValueError(f"{path} is damaged (no object): {remedy}")
+    if missing := [key for key in ("command", "commit", *needed) if result.get(key) in (None, [])]:
+        raise ValueError(f"{path} is damaged (it has no {', '.join(missing)}): {remedy}")
+    return result

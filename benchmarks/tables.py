@@ -1,0 +1,193 @@
+"""Every figure of a study, for machines: one row a method, and one row a replicate."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from benchmarks.harness import Result
+from benchmarks.looks import look
+from benchmarks.registry import Kind
+from benchmarks.statistics import (
+    first_crossing,
+    interquartile_mean,
+    median_steps,
+    probability_of_improvement,
+    quartiles,
+    solved_at,
+)
+from benchmarks.study import ROBOT_ALONE, Measure, Study
+
+__all__ = ["SUBJECT", "Row", "figures", "replicates", "to_csv"]
+
+Row = dict[str, Any]
+"""A row of a table by the names of its columns; None where there is nothing to say."""
+
+SUBJECT = "famle"
+"""The method that all others are compared with."""
+
+
+def figures(study: Study) -> list[Row]:
+    """Every figure of every method, then the paper's methods that no measured one stands beside."""
+    rows = []
+    for method, runs in study.runs.items():
+        row: Row = {"method": method, "label": look(method).label, "replicates": len(runs)}
+        for measure in study.measures:
+            row |= _spread(study, method, measure)
+        row |= _KINDS[study.experiment.kind](study, runs)
+        row |= _times(study, method)
+        for measure in study.measures:
+            row |= _improvement(study, method, measure)
+        rows.append(row | _published(study, look(method).paper))
+    shown = {look(method).paper for method in study.runs}
+    for published in study.experiment.paper:
+        if published.method not in shown:
+            row = {"method": published.method, "label": f"{published.method}, in the paper alone", "replicates": 0}
+            rows.append(row | _published(study, published.method))
+    return rows
+
+
+def replicates(study: Study) -> list[Row]:
+    """One row a replicate, of learning curves one row an episode."""
+    rows = []
+    for method, runs in study.runs.items():
+        for run in runs:
+            row: Row = {"experiment": study.experiment.folder, "method": method, "seed": run["seed"]}
+            row["situation"] = run.get("situation")
+            if study.experiment.kind == "curves":
+                ends = np.cumsum(run["lengths"])
+                for i, value in enumerate(run["returns"]):
+                    rows.append(row | {"episode": i + 1, "robot_steps": int(ends[i]), "return": value})
+            else:
+                keys = ("return", "gaits", "reached", "fell", "distance")
+                rows.append(row | {key: run[key] for key in keys if key in run})
+    return rows
+
+
+def to_csv(rows: Sequence[Row]) -> str:
+    """Rows as comma-separated values, with a column for each name that is in any of them."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(
+        {name: round(value, 4) if isinstance(value, float) else value for name, value in row.items()} for row in rows
+    )
+    return text.getvalue()
+
+
+def _spread(study: Study, method: str, measure: Measure) -> Row:
+    """Median, quartiles and interquartile mean of a figure, and how much of the oracle's it is."""
+    scores = study.scores(method, measure)
+    low, median, high = quartiles(scores)
+    mean, mean_low, mean_high = interquartile_mean(scores)
+    row = {"median": median, "low": low, "high": high, "iqm": mean, "iqm_low": mean_low, "iqm_high": mean_high}
+    if pair := study.of_oracle(method, measure):
+        ours, oracle = (interquartile_mean(values)[0] for values in pair)
+        over, under = (ours, oracle) if measure.higher_is_better else (oracle, ours)
+        row |= {"of_oracle": over / under if under > 0 else None, "oracle_seeds": len(pair[0])}
+    return {f"{measure.key}_{name}": value for name, value in row.items()}
+
+
+def _times(study: Study, method: str) -> Row:
+    """A control step: of the replicates themselves, and in one run with the other methods."""
+    row: Row = {"ms": study.own_time(method)}
+    if (together := study.step_times.get(method)) is not None:
+        row |= {"step_ms": together, "times_robot_alone": together / study.step_times[ROBOT_ALONE]}
+    return row
+
+
+def _improvement(study: Study, method: str, measure: Measure) -> Row:
+    """The probability that a replicate of FAMLE is better than one of another method."""
+    if method == SUBJECT or SUBJECT not in study.runs:
+        return {}
+    sign = 1.0 if measure.higher_is_better else -1.0
+    ours, theirs = (sign * study.scores(name, measure) for name in (SUBJECT, method))
+    names = (f"{measure.key}_famle_better{suffix}" for suffix in ("", "_low", "_high"))
+    return dict(zip(names, probability_of_improvement(ours, theirs), strict=True))
+
+
+def _curves(study: Study, runs: Sequence[Result]) -> Row:
+    threshold = study.experiment.threshold
+    solved = _solved_at(study, runs)
+    early = [_within(run, study.steps) for run in runs]
+    second = [run["returns"][1] for run in runs if len(run["returns"]) > 1]
+    return {
+        "second_episode_median": np.median(second) if second else None,
+        "robot_steps": min(sum(run["lengths"]) for run in runs),
+        "solved_in_common_steps": sum(solved_at(*run, threshold) is not None for run in early),
+        "solved": sum(step is not None for step in solved),
+        "solved_at": median_steps(solved),
+        "famle_faster_by": _famle_faster_by(study, runs),
+        "first_crossing": median_steps([first_crossing(run["returns"], run["lengths"], threshold) for run in runs]),
+    }
+
+
+def _episode(study: Study, runs: Sequence[Result]) -> Row:
+    return {"solved": sum(run["return"] > study.experiment.threshold for run in runs)}
+
+
+def _gaits(study: Study, runs: Sequence[Result]) -> Row:
+    gaits = [run["gaits"] for run in runs if run["reached"]]
+    return {
+        "success": len(gaits) / len(runs),
+        "steps_mean": np.mean(gaits) if gaits else None,
+        "steps_deviation": np.std(gaits) if gaits else None,
+    }
+
+
+def _distance(study: Study, runs: Sequence[Result]) -> Row:
+    ways = [study.trace(run)[1] for run in runs]
+    return {
+        "furthest_median": np.median([way.max() for way in ways]),
+        "furthest_after_median": np.median([way.argmax() for way in ways]),
+        "falls": sum(run["fell"] for run in runs),
+    }
+
+
+_KINDS: Mapping[Kind, Callable[[Study, Sequence[Result]], Row]] = {
+    "curves": _curves,
+    "episode": _episode,
+    "gaits": _gaits,
+    "distance": _distance,
+}
+"""What only one kind of experiment has."""
+
+
+def _within(run: Result, steps: int) -> tuple[list[float], list[int]]:
+    """Returns and lengths of the episodes that end within some robot steps."""
+    whole = int(np.searchsorted(np.cumsum(run["lengths"]), steps, side="right"))
+    return run["returns"][:whole], run["lengths"][:whole]
+
+
+def _solved_at(study: Study, runs: Sequence[Result]) -> list[int | None]:
+    return [solved_at(run["returns"], run["lengths"], study.experiment.threshold) for run in runs]
+
+
+def _famle_faster_by(study: Study, runs: Sequence[Result]) -> float | None:
+    """How many more steps than FAMLE a method needs, as a fraction of FAMLE's; None where FAMLE never gets there."""
+    subject = study.runs.get(SUBJECT)
+    if subject is None or runs is subject:
+        return None
+    famle, other = (median_steps(_solved_at(study, some)) for some in (subject, runs))
+    return other / famle - 1.0 if np.isfinite(famle) else None
+
+
+def _published(study: Study, method: str) -> Row:
+    """The paper's figures of a method."""
+    published = next((row for row in study.experiment.paper if row.method == method), None)
+    if published is None:
+        return {}
+    row: Row = {"paper": str(published)}
+    for field in fields(published)[1:]:
+        value = getattr(published, field.name)
+        if isinstance(value, tuple):
+            row |= {f"paper_{field.name}_mean": value[0], f"paper_{field.name}_deviation": value[1]}
+        elif value is not None and field.name != "remark":
+            row[f"paper_{field.name}"] = value
+    return row

@@ -1,0 +1,295 @@
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.looks import LOOKS, in_order, look
+from benchmarks.registry import EXPERIMENTS, Experiment, Published
+from benchmarks.reporting import Report
+
+PNG = b"\x89PNG"
+
+
+def store(results: Path, folder: str, method: str, seed: int, **figures: Any) -> Path:
+    """Stores a replicate as a benchmark does."""
+    path = results / folder / f"{method}-{seed}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    source = {"command": f"python -m benchmarks.x --methods {method}", "commit": "abc1234"}
+    path.write_text(json.dumps({"method": method, "seed": seed, **source, **figures}))
+    return path
+
+
+def store_curves(
+    results: Path, method: str, returns: Sequence[Sequence[float]], length: int = 50, folder: str = "reacher-paper"
+) -> None:
+    """Stores learning curves, one a seed."""
+    for seed, values in enumerate(returns):
+        lengths = [length] * len(values)
+        store(results, folder, method, seed, returns=list(values), lengths=lengths, seconds_per_step=0.02)
+
+
+def store_gaits(results: Path, method: str, gaits: Sequence[int | None], folder: str = "quadruped-yaw") -> None:
+    """Stores journeys to a goal, one a seed; None is one that did not get there."""
+    for seed, n in enumerate(gaits):
+        path = [[0.1 * i, 0.0] for i in range((n or 80) + 1)]
+        reached = {"reached": n is not None, "fell": False, "distance": path[-1][0]}
+        store(results, folder, method, seed, gaits=n or 80, path=path, ms_per_plan=5.0, **reached)
+
+
+def store_walks(results: Path, method: str, ways: Sequence[Sequence[float]]) -> None:
+    """Stores walks by their x, one a seed."""
+    for seed, xs in enumerate(ways):
+        figures = {"gaits": len(xs) - 1, "distance": xs[-1], "path": [[x, 0.0] for x in xs], "fell": False}
+        store(results, "minitaur-reality", method, seed, ms_per_plan=5.0, **figures)
+
+
+def store_runs(results: Path, method: str, returns: Sequence[float], folder: str = "ant-unseen") -> None:
+    """Stores first episodes, one a seed."""
+    for seed, value in enumerate(returns):
+        milliseconds = {"mean": 13.0, "median": 12.0, "p99": 15.0}
+        store(results, folder, method, seed, **{"return": value}, speed=[value / 1000] * 20, ms_per_step=milliseconds)
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    """The folder of the results, empty."""
+    return tmp_path / "results"
+
+
+@pytest.fixture
+def arm(results: Path) -> Path:
+    """Learning curves of FAMLE and the oracle, four episodes of 50 steps."""
+    store_curves(results, "famle", [[20.0, 35.0, 35.0, 35.0], [35.0, 35.0, 35.0, 35.0]])
+    store_curves(results, "oracle", [[40.0] * 4] * 2)
+    return results
+
+
+@pytest.fixture
+def ant(results: Path) -> Path:
+    """First episodes of FAMLE, with and without adaptation."""
+    store_runs(results, "famle", [2000.0, 2400.0])
+    store_runs(results, "famle-frozen", [700.0, 900.0])
+    return results
+
+
+@pytest.fixture
+def quadruped(results: Path) -> Path:
+    """Journeys of FAMLE and a rival that fails once."""
+    store_gaits(results, "famle", [10, 20])
+    store_gaits(results, "ampc-reptile", [40, None])
+    return results
+
+
+@pytest.fixture
+def minitaur(results: Path) -> Path:
+    """Walks of FAMLE, one of which ends behind where it has been."""
+    store_walks(results, "famle", [[0.0, 3.0, 5.0, 4.0], [0.0, 3.0, 4.0, 5.0]])
+    return results
+
+
+def report(results: Path) -> tuple[str, Path]:
+    """The report of some results, and its folder."""
+    out = results.parent / "report"
+    Report(results, out)()
+    return (out / "report.md").read_text(), out
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def by_name(path: Path) -> dict[str, dict[str, str]]:
+    return {row["method"]: row for row in read_csv(path)}
+
+
+def rows_of(text: str, label: str) -> list[list[str]]:
+    """The cells of all table rows that begin with a label."""
+    lines = [line for line in text.splitlines() if line.startswith(f"| {label} |")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_report_has_a_section_a_picture_and_a_table_for_every_experiment_that_is_stored(
+    results: Path, arm: Path, ant: Path, quadruped: Path, minitaur: Path
+) -> None:
+    text, out = report(results)
+    for name in ("reacher-paper", "ant-unseen", "quadruped", "minitaur-reality", "time"):
+        assert (out / f"{name}.png").read_bytes().startswith(PNG)
+        assert f"]({name}.png)" in text
+    assert {path.stem for path in out.glob("*.csv")} == {
+        *("reacher-paper", "ant-unseen", "quadruped-yaw", "minitaur-reality", "replicates")
+    }
+    assert text.count("\n## Arm, the paper's damage") == 1
+    assert "- `python -m benchmarks.x --methods famle` at `abc1234`: FAMLE (`famle`)" in text
+    assert not list(out.glob("*.partial"))
+
+
+def test_experiments_without_results_are_named_as_not_measured(arm: Path) -> None:
+    text, _ = report(arm)
+    shown, missing = text.split("## Not measured")
+    assert "`ant-curves`" in missing
+    assert "python -m benchmarks.ant --experiment curves" in missing
+    assert "`reacher-paper`" not in missing
+    assert "figure 4" not in shown
+
+
+def test_folders_that_no_experiment_knows_are_named(ant: Path) -> None:
+    store_runs(ant, "famle", [1.0], folder="ant-moon")
+    assert "`ant-moon`" in report(ant)[0].split("## Stored and not shown")[1]
+
+
+def test_figures_of_curves_are_those_of_the_replicates(arm: Path) -> None:
+    text, out = report(arm)
+    row = by_name(out / "reacher-paper.csv")["famle"]
+    assert float(row["first_episode_median"]) == 27.5
+    assert float(row["mean_return_median"]) == pytest.approx((31.25 + 35.0) / 2)
+    assert float(row["first_episode_of_oracle"]) == pytest.approx(27.5 / 40.0, abs=1e-4)
+    assert float(row["solved_at"]) == 75.0
+    assert row["solved_in_common_steps"] == "2"
+    assert float(row["ms"]) == 20.0
+    assert rows_of(text, "FAMLE")[0][-1] == "solved at about 500 steps"
+
+
+def test_curves_are_compared_over_the_steps_that_all_have_and_long_budgets_are_told_apart(arm: Path) -> None:
+    store_curves(arm, "ppo", [[0.0] * 10 + [50.0] * 10] * 2)
+    text, out = report(arm)
+    rows = by_name(out / "reacher-paper.csv")
+    assert float(rows["ppo"]["mean_return_median"]) == 0.0
+    assert (rows["ppo"]["solved_in_common_steps"], rows["ppo"]["solved"]) == ("0", "2")
+    assert (rows["ppo"]["robot_steps"], rows["famle"]["robot_steps"]) == ("1000", "200")
+    assert float(rows["ppo"]["solved_at"]) == 550.0
+    assert float(rows["ppo"]["famle_faster_by"]) == pytest.approx(550.0 / 75.0 - 1.0, abs=1e-4)
+    assert "mean return over 200 robot steps" in text
+    assert "200 robot steps instead of 1,000" in text
+
+
+def test_success_rate_and_gaits_stand_beside_the_paper_s(quadruped: Path) -> None:
+    text, out = report(quadruped)
+    ours, rival = rows_of(text, "FAMLE"), rows_of(text, "AMPC-MAML (Reptile)")[0]
+    table = next(row for row in ours if "32.6" in row[-1])
+    assert table[2:4] == ["15.0 +- 5.0", "100 %"]
+    assert table[-1] == "32.6 +- 2.3 gaits, 63.4 +- 4.5 s, 100 %"
+    assert rival[2:4] == ["40.0 +- 0.0", "50 %"]
+    assert rival[-1].startswith("61.8 +- 7.2 gaits, 120.1 +- 13.9 s, 40 %")
+    assert rows_of(text, "AMPC, in the paper alone")[0][-1] == "0 %"
+    rows = by_name(out / "quadruped-yaw.csv")
+    assert float(rows["ampc-reptile"]["gaits_median"]) == (40 + 81) / 2
+    assert float(rows["ampc-reptile"]["gaits_famle_better"]) == 1.0
+    assert float(rows["famle"]["paper_steps_mean"]) == 32.6
+
+
+def test_distance_is_the_furthest_and_the_time_until_there(minitaur: Path) -> None:
+    text, out = report(minitaur)
+    table = next(row for row in rows_of(text, "FAMLE") if row[-1] == "4.8 m in 60 s")
+    assert table[2:4] == ["5.0", "2"]
+    rivals = [row[-1] for row in rows_of(text, "AMPC-MAML, in the paper alone")]
+    assert "1.6 m in 90 s, FAMLE about 50 % faster" in rivals
+    assert float(by_name(out / "minitaur-reality.csv")["famle"]["distance_median"]) == 4.5
+
+
+def test_probability_of_improvement_is_of_famle_over_the_others(ant: Path) -> None:
+    store_runs(ant, "famle-nearest", [2000.0, 2400.0])
+    rows = by_name(report(ant)[1] / "ant-unseen.csv")
+    assert float(rows["famle-frozen"]["return_famle_better"]) == 1.0
+    assert float(rows["famle-nearest"]["return_famle_better"]) == 0.5
+    assert rows["famle"]["return_famle_better"] == ""
+    assert rows["famle-frozen"]["solved"] == "1"
+
+
+def test_baselines_that_win_are_named(arm: Path) -> None:
+    store_curves(arm, "ampc", [[1.0, 38.0, 38.0, 38.0]] * 2)
+    line = next(line for line in report(arm)[0].splitlines() if line.startswith("Better than FAMLE"))
+    first, mean, last = line.split(";")
+    assert first.endswith(": oracle (return of the first episode)")
+    assert mean == " oracle (mean return over 200 robot steps)"
+    assert last == " AMPC / oracle (return of the episode at 200 robot steps)."
+
+
+def test_results_without_famle_are_reported_all_the_same(tmp_path: Path) -> None:
+    store_curves(tmp_path / "results", "ampc", [[1.0, 2.0, 3.0]])
+    text, _ = report(tmp_path / "results")
+    assert rows_of(text, "AMPC")
+    assert "| method | n | P(FAMLE better)" not in text
+
+
+def test_unknown_method_is_shown_under_its_own_name_after_the_known_ones(arm: Path) -> None:
+    store_curves(arm, "magic", [[1.0, 2.0, 3.0, 4.0]] * 2)
+    text, out = report(arm)
+    assert rows_of(text, "magic")
+    assert list(by_name(out / "reacher-paper.csv"))[:3] == ["famle", "oracle", "magic"]
+    assert look("magic").label == "magic"
+    assert in_order(["magic", "oracle", "famle"]) == ["famle", "oracle", "magic"]
+
+
+def test_fewer_replicates_than_others_or_the_paper_are_said_in_the_title(arm: Path) -> None:
+    store_curves(arm, "ampc", [[1.0, 2.0, 3.0, 4.0]])
+    title = next(line for line in report(arm)[0].splitlines() if line.startswith("## Arm"))
+    assert "2 replicates, the paper has 30; 1 of AMPC" in title
+
+
+def test_oracle_is_compared_over_the_seeds_that_both_have(ant: Path) -> None:
+    store_runs(ant, "oracle", [4000.0])
+    text, out = report(ant)
+    row = by_name(out / "ant-unseen.csv")["famle"]
+    assert (float(row["return_of_oracle"]), row["return_oracle_seeds"]) == (0.5, "1")
+    assert any(row[-1] == "50 % (1)" for row in rows_of(text, "FAMLE"))
+
+
+def test_tidy_table_has_a_row_a_replicate_and_of_curves_a_row_an_episode(
+    results: Path, arm: Path, quadruped: Path
+) -> None:
+    rows = read_csv(report(results)[1] / "replicates.csv")
+    curves = [row for row in rows if (row["experiment"], row["method"]) == ("reacher-paper", "famle")]
+    assert [(row["seed"], row["episode"], row["robot_steps"]) for row in curves[:2]] == [
+        ("0", "1", "50"),
+        ("0", "2", "100"),
+    ]
+    assert len(curves) == 8
+    gaits = [row for row in rows if (row["experiment"], row["method"]) == ("quadruped-yaw", "ampc-reptile")]
+    assert [(row["gaits"], row["reached"]) for row in gaits] == [("40", "True"), ("80", "False")]
+
+
+def test_without_results_the_remedy_is_named_and_nothing_is_written(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"run a benchmark first, such as: python -m benchmarks\.reacher"):
+        Report(tmp_path / "results", tmp_path / "report")()
+    assert not (tmp_path / "report").exists()
+
+
+@pytest.mark.parametrize(
+    "content", ["", '{"method": "famle", "se', "[1, 2]", '{"method": "famle", "seed": 0, "command": "", "commit": ""}']
+)
+def test_damaged_result_is_named_with_a_remedy_and_nothing_is_written(arm: Path, content: str) -> None:
+    (arm / "reacher-paper" / "famle-1.json").write_text(content)
+    with pytest.raises(ValueError, match=r"famle-1\.json is damaged .*delete the file and run the benchmark again"):
+        report(arm)
+    assert not (arm.parent / "report").exists()
+
+
+def test_replicate_without_a_whole_episode_is_refused(arm: Path) -> None:
+    store_curves(arm, "ampc", [[]])
+    with pytest.raises(ValueError, match=r"ampc-0\.json is damaged \(it has no returns, lengths\)"):
+        report(arm)
+
+
+def test_report_is_the_same_the_second_time(quadruped: Path) -> None:
+    first, out = report(quadruped)
+    tables = {path.name: path.read_bytes() for path in out.glob("*.csv")}
+    assert report(quadruped)[0] == first
+    assert tables == {path.name: path.read_bytes() for path in out.glob("*.csv")}
+
+
+def test_registry_names_every_experiment_once_and_the_paper_s_methods_as_the_looks_do() -> None:
+    assert len({experiment.folder for experiment in EXPERIMENTS}) == len(EXPERIMENTS)
+    stands_beside = {look.paper for look in LOOKS.values()}
+    assert {row.method for experiment in EXPERIMENTS for row in experiment.paper} <= stands_beside
+    assert str(Published("FAMLE", distance=4.8, time=60.0)) == "4.8 m in 60 s"
+
+
+def test_curves_cannot_share_a_picture() -> None:
+    with pytest.raises(ValueError, match="side by side"):
+        Experiment("arm-x", "Arm", "curves", "python", "", budget=100, picture="arms")
