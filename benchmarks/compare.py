@@ -8,6 +8,7 @@ from pathlib import Path
 
 from benchmarks.harness import Fleet, Options, Replicate, ReplicateError, Result, is_stored, run_replicates
 from benchmarks.methods import METHODS, Method, Task
+from famle_agent.cluster import parallel
 
 __all__ = ["compare"]
 
@@ -47,7 +48,8 @@ def compare(
         else:
             replicates = [Replicate(method, task.seed, partial(run, method, task)) for task in tasks]
         if not all(is_stored(some, folder) for some in replicates):
-            known[method].learn(tasks[0])  # once, before the replicates want it in their processes
+            with parallel(options.backend):
+                known[method].learn(tasks[0])  # once, before the replicates want it in their processes
         try:
             run_replicates(replicates, folder, options.jobs, options.backend)
         except ReplicateError as error:

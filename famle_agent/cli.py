@@ -15,6 +15,7 @@ from rich.console import Console
 from benchmarks.harness import ReplicateError
 from benchmarks.reporting import Report
 from benchmarks.suite import Benchmark
+from famle_agent.cluster import Backend, parallel
 from famle_agent.demo import run_demo, run_episode
 from famle_agent.errors import NotLearnedError
 from famle_agent.famle import FAMLE
@@ -68,6 +69,8 @@ class MetaLearn:
     """Seed of everything."""
     jobs: int = -1
     """Processes that simulate, -1 for one a core."""
+    backend: Backend = "loky"
+    """Where they run: on this machine, or in a Ray cluster (RAY_ADDRESS, or one that is started here)."""
     folder: Path | None = None
     """Folder for the transitions and the models on the way; the same command goes on where it was stopped."""
     tensorboard: Path | None = None
@@ -77,7 +80,9 @@ class MetaLearn:
         """Meta-learns and saves."""
         log = None if self.tensorboard is None else str(self.tensorboard)
         agent = FAMLE(self.robot, self.mode, seed=self.seed, tensorboard_log=log)
-        agent.meta_learn(progress_bar=True, n_jobs=self.jobs, folder=self.folder).save(self.out)
+        with parallel(self.backend):
+            agent.meta_learn(progress_bar=True, n_jobs=self.jobs, folder=self.folder)
+        agent.save(self.out)
         Console().print(f"Saved {self.out}.")
 
 
