@@ -13,7 +13,6 @@ from famle_agent.adaptation import Belief, descend
 from famle_agent.agent import ModelBasedAgent
 from famle_agent.dynamics import expand
 from famle_agent.memory import Memory
-from famle_agent.meta_learning import MetaStep
 from famle_agent.online import OnlineState
 from famle_agent.transitions import Transitions
 
@@ -115,15 +114,7 @@ class AMPCMAML(_OneModelAgent):
     def _learn_model(
         self, transitions: Transitions, round_: int, last: bool, on_iteration: Callable[[dict[str, float]], bool]
     ) -> None:
-        """Training on all situations at once in each round, and in the last one Reptile or MAML."""
-        settings, (model, data) = self.hyperparameters, self._begin_model(transitions, round_)
-
-        def log(step: MetaStep) -> bool:
-            return on_iteration({"meta/loss_before": step.loss_before, "meta/loss_after": step.loss_after})
-
-        joint_training = settings.joint_training(round_)
-        finished = joint_training(model, data, self._generator, lambda loss: on_iteration({"meta/joint_loss": loss}))
-        if last and finished and settings.meta_iterations:
-            learn = settings.reptile() if settings.meta_learner == "reptile" else settings.maml()
-            learn(model, data, settings.inner_loop(), self._generator, log)
-        model.fit_noise(data)
+        """Joint training in each round, and in the last one Reptile or MAML."""
+        settings = self.hyperparameters
+        learn = settings.reptile() if settings.meta_learner == "reptile" else settings.maml()
+        self._meta_train(transitions, round_, last and settings.meta_iterations > 0, learn, on_iteration)

@@ -13,7 +13,6 @@ from famle_agent.adaptation import Belief, Candidates, adapt, filtered_posterior
 from famle_agent.agent import ModelBasedAgent
 from famle_agent.dashboard import log_embeddings
 from famle_agent.memory import Memory
-from famle_agent.meta_learning import MetaStep
 from famle_agent.online import OnlineState
 from famle_agent.transitions import Transitions
 
@@ -48,16 +47,7 @@ class FAMLE(ModelBasedAgent):
         self, transitions: Transitions, round_: int, last: bool, on_iteration: Callable[[dict[str, float]], bool]
     ) -> None:
         """Joint training in each round, and in the last one Algorithm 1: Reptile on theta and H."""
-        settings, (model, data) = self.hyperparameters, self._begin_model(transitions, round_)
-
-        def log(step: MetaStep) -> bool:
-            return on_iteration({"meta/loss_before": step.loss_before, "meta/loss_after": step.loss_after})
-
-        joint_training = settings.joint_training(round_)
-        finished = joint_training(model, data, self._generator, lambda loss: on_iteration({"meta/joint_loss": loss}))
-        if last and finished:
-            settings.reptile()(model, data, settings.inner_loop(), self._generator, log)
-        model.fit_noise(data)
+        model = self._meta_train(transitions, round_, last, self.hyperparameters.reptile(), on_iteration)
         if last:
             log_embeddings(self.logger, model.embeddings[0], self.situations, self.num_timesteps)
 

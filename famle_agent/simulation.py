@@ -21,6 +21,8 @@ from typing_extensions import Self
 from famle_agent.algorithm import ModelBasedAlgorithm
 from famle_agent.dynamics import Batch, Dynamics
 from famle_agent.envs import EnvLike, SituationEnvs, situation_envs
+from famle_agent.maml import MAML
+from famle_agent.meta_learning import MetaStep, Reptile
 from famle_agent.policies import MakePolicy, make_held_uniform, make_planning
 from famle_agent.run_folder import RunFolder
 from famle_agent.transitions import Transitions, collect
@@ -230,3 +232,24 @@ class SimulationLearner(ModelBasedAlgorithm):
             self.dynamics.fit_normalisation(obs, next_obs)
         model = self._require_dynamics()
         return model, model.encode(obs, action, next_obs)
+
+    def _meta_train(
+        self,
+        transitions: Transitions,
+        round_: int,
+        last: bool,
+        learn: Reptile | MAML,
+        on_iteration: Callable[[dict[str, float]], bool],
+    ) -> Dynamics:
+        """Trains the model on all situations at once, and in the last round meta-learns from there."""
+        settings, (model, data) = self.hyperparameters, self._begin_model(transitions, round_)
+
+        def log(step: MetaStep) -> bool:
+            return on_iteration({"meta/loss_before": step.loss_before, "meta/loss_after": step.loss_after})
+
+        joint_training = settings.joint_training(round_)
+        finished = joint_training(model, data, self._generator, lambda loss: on_iteration({"meta/joint_loss": loss}))
+        if last and finished:
+            learn(model, data, settings.inner_loop(), self._generator, log)
+        model.fit_noise(data)
+        return model
