@@ -90,7 +90,8 @@ def _pictures(studies: Sequence[Study]) -> dict[str, bytes]:
 
 
 def _with_returns(studies: Sequence[Study]) -> list[Study]:
-    return [study for study in studies if study.experiment.kind in ("curves", "episode")]
+    """Those whose returns can be drawn against the times of several methods."""
+    return [study for study in studies if study.experiment.kind in ("curves", "episode") and len(study.times) > 1]
 
 
 def _png(figure: Figure) -> bytes:

@@ -109,8 +109,9 @@ def by_name(path: Path) -> dict[str, dict[str, str]]:
 
 
 def rows_of(text: str, label: str) -> list[list[str]]:
-    """The cells of all table rows that begin with a label."""
-    lines = [line for line in text.splitlines() if line.startswith(f"| {label} |")]
+    """The cells of all table rows of experiments that begin with a label."""
+    experiments = text.partition("## All robots")[2].partition("\n## ")[2]
+    lines = [line for line in experiments.splitlines() if line.startswith(f"| {label} |")]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
