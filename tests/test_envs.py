@@ -140,10 +140,10 @@ def test_quaternions_are_those_of_the_environment_or_of_the_user(make_env: MakeE
     assert FAMLE(ant, device="cpu", pretrained=False)._dims["quaternion_dims"] == (1, 2, 3, 4)
     own = FAMLE(ant, device="cpu", pretrained=False, quaternion_dims=())
     assert own._dims["quaternion_dims"] == ()
-    assert own._new_dynamics(2).n_features == 27
+    assert own._new_dynamics().n_features == 27
     assert FAMLE(make_env(), device="cpu")._dims["quaternion_dims"] == ()
     turned = FAMLE(make_env(), device="cpu", angle_dims=(0,), quaternion_dims=(4, 3, 2, 1))
-    assert turned._new_dynamics(2).n_features == 7 + 2 + 10
+    assert turned._new_dynamics().n_features == 7 + 2 + 10
 
 
 @pytest.mark.parametrize(
