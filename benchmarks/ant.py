@@ -29,8 +29,8 @@ from benchmarks import curves
 from benchmarks.compare import compare
 from benchmarks.harness import Options, Result, load_results
 from benchmarks.methods import METHODS, PPO_METHODS, Method, Task, famle
-from benchmarks.report import by_method, interquartile_mean, plot_curves, quartiles
-from benchmarks.report import summary as summary_of_curves
+from benchmarks.summaries import by_method, interquartile_mean, plot_curves, quartiles
+from benchmarks.summaries import summary as summary_of_curves
 from famle_agent import FAMLE, FAMLEWrapper, ModelBasedAgent
 from famle_agent.plots import style
 from famle_agent.walking import BrokenRun, run_and_break

@@ -30,6 +30,7 @@ __all__ = [
     "provenance",
     "run_replicates",
     "write_json",
+    "write_whole",
 ]
 
 Result = dict[str, Any]
@@ -158,10 +159,15 @@ def provenance(argv: list[str]) -> Result:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes a file that is either whole or not there."""
+    """Writes a value as JSON, as :func:`write_whole`."""
+    write_whole(path, (json.dumps(value, indent=1) + "\n").encode())
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Writes a file that is either whole or not there; an older one stays until the new one is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(value, indent=1) + "\n")
+    partial = path.with_name(f"{path.name}.partial")
+    partial.write_bytes(content)
     partial.replace(path)
 
 

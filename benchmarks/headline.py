@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.harness import write_whole
 from benchmarks.looks import in_order, look
 from benchmarks.study import Study
 from benchmarks.tables import Row, figures
@@ -82,6 +83,4 @@ def insert(table: str, readme: Path) -> None:
         raise ValueError(
             f"{readme} has no place for the table: a line <!-- report -->, and one <!-- end of report -->."
         )
-    partial = readme.with_name(f"{readme.name}.partial")
-    partial.write_text(_BLOCK.sub(lambda marks: f"{marks[1]}{table}\n{marks[2]}", text))
-    partial.replace(readme)
+    write_whole(readme, _BLOCK.sub(lambda marks: f"{marks[1]}{table}\n{marks[2]}", text).encode())

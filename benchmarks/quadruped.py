@@ -21,7 +21,7 @@ from benchmarks.compare import compare
 from benchmarks.gait_robots import run
 from benchmarks.harness import Options, Result, load_results
 from benchmarks.methods import Task
-from benchmarks.report import by_method
+from benchmarks.summaries import by_method
 from famle_agent.plots import plot_paths
 from famle_envs import Situation
 from famle_envs.quadruped import LEGS, REALITY, blocked_leg

@@ -19,7 +19,7 @@ from benchmarks import curves
 from benchmarks.compare import compare
 from benchmarks.harness import Options, Result, load_results
 from benchmarks.methods import METHODS, PPO_METHODS, Task
-from benchmarks.report import plot_curves, summary
+from benchmarks.summaries import plot_curves, summary
 from famle_envs import Situation
 from famle_envs.reacher import ReacherEnv
 

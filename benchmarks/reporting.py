@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from benchmarks.comparison_board import write_board
+from benchmarks.harness import write_whole
 from benchmarks.headline import headline, insert
 from benchmarks.markdown import document, section
 from benchmarks.pictures import draw, draw_times
@@ -49,7 +50,7 @@ class Report:
             )
         missing = [experiment for experiment, study in found.items() if study is None]
         for name, content in {**_pictures(studies), **_texts(studies, missing, self._unknown())}.items():
-            _write(self.out / name, content)
+            write_whole(self.out / name, content)
         if self.readme is not None:
             insert(headline(studies), self.readme)
         if self.tensorboard is not None:
@@ -98,11 +99,3 @@ def _png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=150)
     return buffer.getvalue()
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Writes a file that is either whole or not there."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.partial")
-    partial.write_bytes(content)
-    partial.replace(path)

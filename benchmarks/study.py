@@ -13,8 +13,8 @@ import numpy as np
 from benchmarks.harness import Result
 from benchmarks.looks import in_order, look
 from benchmarks.registry import Experiment, Kind
-from benchmarks.report import by_method
 from benchmarks.statistics import Array, quartiles
+from benchmarks.summaries import by_method
 
 __all__ = ["ROBOT_ALONE", "Measure", "Study", "quartiles_over_steps", "read_study"]
 

@@ -23,7 +23,6 @@ from famle_agent.errors import NotLearnedError
 from famle_agent.hyperparameters import Hyperparameters, robot_of
 from famle_agent.observation import DIMS, ObservationLayout
 from famle_agent.planning import RewardFn
-from famle_agent.policies import REWARDS
 from famle_agent.reward import LearnedReward
 from famle_agent.units import ActionScale
 
@@ -197,12 +196,6 @@ class ModelBasedAlgorithm(BaseAlgorithm):
     def _new_reward(self) -> LearnedReward:
         model = self._require_dynamics()
         return LearnedReward(model.layout, model.action_dim).to(self.device)
-
-    @property
-    def _reward_names(self) -> tuple[str, ...]:
-        """What the environment may call what the planner maximises."""
-        name = self.hyperparameters.planning_reward
-        return (name,) if name else REWARDS
 
     def _known_reward_fn(self) -> RewardFn | None:
         """The user's reward function, or the environment's."""

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from famle_agent.hyperparameters import known_robots
 from famle_agent.planning import RewardFn
-from famle_agent.policies import REWARDS
+from famle_agent.policies import reward_names
 from famle_agent.transitions import EnvSource
 from famle_envs.reality import Profile
 from famle_envs.situation import Situation
@@ -204,8 +204,7 @@ def planning_reward(env: VecEnv, name: str) -> RewardFn | None:
     """
     if name and not env.has_attr(name):
         raise ValueError(f"The environment has no {name!r}; planning_reward must name a function of it, or be empty.")
-    names = (name,) if name else REWARDS
-    known: list[RewardFn] = [env_attribute(env, name, None) for name in names if env.has_attr(name)]
+    known: list[RewardFn] = [env_attribute(env, name, None) for name in reward_names(name) if env.has_attr(name)]
     return known[0] if known else None
 
 

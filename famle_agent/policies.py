@@ -16,7 +16,15 @@ from famle_agent.dynamics import Dynamics
 from famle_agent.planning import Model, Planner, RewardFn, imagine, shift
 from famle_agent.units import ActionScale
 
-__all__ = ["REWARDS", "HeldUniformPolicy", "MakePolicy", "PlanningPolicy", "make_held_uniform", "make_planning"]
+__all__ = [
+    "REWARDS",
+    "HeldUniformPolicy",
+    "MakePolicy",
+    "PlanningPolicy",
+    "make_held_uniform",
+    "make_planning",
+    "reward_names",
+]
 
 Array = npt.NDArray[Any]
 
@@ -30,6 +38,12 @@ class Policy(Protocol):
 
 REWARDS = ("planning_reward_fn", "reward_fn")
 """What an environment may call the function that a planner should maximise; the first that it has counts."""
+
+
+def reward_names(named: str) -> tuple[str, ...]:
+    """What to ask an environment for: the function that was named, else the first of :data:`REWARDS` that it has."""
+    return (named,) if named else REWARDS
+
 
 MakePolicy = Callable[[gym.Env[Any, Any], int, np.random.Generator], Policy]
 """A policy for an environment and the index of its situation; picklable where data are collected in processes."""

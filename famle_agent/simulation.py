@@ -23,7 +23,7 @@ from famle_agent.dynamics import Batch, Dynamics
 from famle_agent.envs import EnvLike, SituationEnvs, situation_envs
 from famle_agent.maml import MAML
 from famle_agent.meta_learning import MetaStep, Reptile
-from famle_agent.policies import MakePolicy, make_held_uniform, make_planning
+from famle_agent.policies import MakePolicy, make_held_uniform, make_planning, reward_names
 from famle_agent.run_folder import RunFolder
 from famle_agent.transitions import Transitions, collect
 from famle_agent.units import ActionScale
@@ -183,7 +183,8 @@ class SimulationLearner(ModelBasedAlgorithm):
             def reward_fn(obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
                 return learned(obs, scale.to_unit(action), next_obs)  # type: ignore[no-any-return]
 
-        return make_planning(model, self.hyperparameters.make_planner(), reward_fn, self._reward_names)
+        names = reward_names(self.hyperparameters.planning_reward)
+        return make_planning(model, self.hyperparameters.make_planner(), reward_fn, names)
 
     def _fingerprint(self, source: SituationEnvs | Transitions) -> dict[str, Any]:
         """What two runs must have in common for one to go on where the other stopped."""

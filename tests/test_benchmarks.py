@@ -12,7 +12,7 @@ from joblib import delayed, parallel_config
 from benchmarks import reacher
 from benchmarks.harness import Fleet, Replicate, ReplicateError, is_stored, load_results, run_replicates
 from benchmarks.identification import accuracy, across_the_wrap
-from benchmarks.report import by_method, first_crossing, interquartile_mean, plot_curves, solved_at, summary
+from benchmarks.summaries import by_method, first_crossing, interquartile_mean, plot_curves, solved_at, summary
 from famle_agent import FAMLE, Transitions
 from famle_agent.cluster import as_completed, parallel
 from famle_envs.reacher import ReacherEnv

@@ -73,11 +73,11 @@ def test_each_row_may_have_an_embedding_of_its_own(model: Dynamics, size: int, n
 
 @given(models(), st.integers(1, 3))
 def test_rollouts_of_candidates_are_independent(model: Dynamics, size: int) -> None:
-    theta, h = random_theta(model, size), random_h(model, size)
-    obs, action, _ = random_transitions(model, size * model.members, 5)
-    simulator = model.simulator(theta, h)
-    one, all_ = simulator(obs[:, 2:3], action[:, 2:3]), simulator(obs, action)
-    torch.testing.assert_close(all_[:, 2:3], one, rtol=1e-4, atol=1e-4)
+    # In double precision: in single, batches of another size round otherwise by more than the comparison allows.
+    theta = {name: value.double() for name, value in random_theta(model, size).items()}
+    obs, action = (values.double() for values in random_transitions(model, size * model.members, 5)[:2])
+    simulator = model.double().simulator(theta, random_h(model, size).double())
+    torch.testing.assert_close(simulator(obs, action)[:, 2:3], simulator(obs[:, 2:3], action[:, 2:3]))
 
 
 # --- members of an ensemble -------------------------------------------------------------------------------
