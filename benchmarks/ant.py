@@ -13,6 +13,7 @@ and the agent without embeddings are trained from scratch by their method.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -72,6 +73,8 @@ class Args(Options):
     """Robot steps of the model-based methods in "curves"."""
     ppo_steps: int = 1_000_000
     """Robot steps of PPO in "curves"."""
+    in_step: int = 5
+    """Replicates of one method that act in step at most in "curves", where its robots can do that."""
 
 
 RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
@@ -82,7 +85,7 @@ DEFAULT_METHODS: dict[str, tuple[str, ...]] = {
     "break": ("famle", "famle-window", "famle-frozen"),
     "untrained": ("famle", "famle-frozen", "famle-theta", "famle-validated"),
     "intact": ("famle",),
-    "curves": ("famle", "famle-frozen", *RIVALS, *PPO_METHODS, "oracle"),
+    "curves": ("famle", "famle-frozen", *RIVALS, *PPO_METHODS),
 }
 
 
@@ -159,9 +162,17 @@ def without_embeddings(task: Task) -> FAMLE:
     return FAMLE.load(path, device="cpu", **ADAPTS)
 
 
+def in_step(tasks: Sequence[Task], **overrides: Any) -> FAMLE:
+    """The shipped agent for many robots, with settings changed."""
+    return famle(tasks[0], **overrides)
+
+
 ANT_METHODS = {
     **METHODS,
-    **{name: Method(partial(famle, **overrides)) for name, overrides in VARIANTS.items()},
+    **{
+        name: Method(partial(famle, **overrides), fleet=partial(in_step, **overrides))
+        for name, overrides in VARIANTS.items()
+    },
     **{f"members-{n}": Method(partial(with_members, members=n)) for n in (1, 2, 3)},
     "without-embeddings": Method(without_embeddings, without_embeddings),
     "oracle": Method(oracle),
@@ -171,9 +182,9 @@ ANT_METHODS = {
 
 def run(method: str, task: Task, args: Args) -> Result:
     """One replicate: broken from the first step, or after 300 steps."""
-    agent = ANT_METHODS[method].agent(task)
     if args.experiment == "curves":
-        return curves.run(agent, [task], args.ppo_steps if method in PPO_METHODS else args.curve_steps)[0]
+        return run_fleet(method, [task], args)[0]
+    agent = ANT_METHODS[method].agent(task)
     if not isinstance(agent, ModelBasedAgent):
         raise ValueError(f"{method} learns too little in one episode to be compared in it; see --experiment curves.")
     agent.set_random_seed(task.seed)
@@ -184,6 +195,13 @@ def run(method: str, task: Task, args: Args) -> Result:
     result = run_and_break(env, task.situation, args.steps, break_at, task.seed)
     env.close()
     return _result(result, task.situation)
+
+
+def run_fleet(method: str, tasks: Sequence[Task], args: Args) -> list[Result]:
+    """Many episodes of one replicate, or of many in step."""
+    steps = args.ppo_steps if method in PPO_METHODS else args.curve_steps
+    life = args.life("ant-curves", method, [task.seed for task in tasks])
+    return curves.run(ANT_METHODS[method].on(tasks), tasks, steps, life)
 
 
 def _result(result: BrokenRun, situation: Situation) -> Result:
@@ -248,7 +266,8 @@ def main(args: Args) -> None:
     methods = args.methods or DEFAULT_METHODS[args.experiment]
     folder = args.out / f"ant-{args.experiment}"
     tasks = [Task("ant", seed, damage_of(args.experiment, seed), args.cache) for seed in range(args.replicates)]
-    compare(methods, tasks, partial(run, args=args), folder, args, ANT_METHODS)
+    fleets = partial(run_fleet, args=args) if args.experiment == "curves" else None
+    compare(methods, tasks, partial(run, args=args), folder, args, ANT_METHODS, fleets)
     results, title = load_results(folder), f"Ant, {args.experiment}"
     if args.experiment == "curves":
         Console(width=160).print(summary_of_curves(results, SOLVED, title, within=args.steps))

@@ -44,7 +44,10 @@ def compare(
     for method in methods:
         replicates: list[Replicate | Fleet]
         if run_fleet is not None and known[method].fleet is not None:
-            replicates = [Fleet(method, tuple(task.seed for task in tasks), partial(run_fleet, method, tasks))]
+            fleets = [tasks[i : i + options.in_step] for i in range(0, len(tasks), options.in_step)]
+            replicates = [
+                Fleet(method, tuple(task.seed for task in some), partial(run_fleet, method, some)) for some in fleets
+            ]
         else:
             replicates = [Replicate(method, task.seed, partial(run, method, task)) for task in tasks]
         if not all(is_stored(some, folder) for some in replicates):

@@ -5,44 +5,91 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from benchmarks.harness import Result
+from benchmarks.lives import History, Repeatable, read_life, write_life
 from benchmarks.methods import Task
+from famle_agent import ModelBasedAgent
 
 __all__ = ["run"]
 
 
-def run(agent: BaseAlgorithm, tasks: Sequence[Task], steps: int) -> list[Result]:
+def run(
+    agent: BaseAlgorithm, tasks: Sequence[Task], steps: int, saved: Path | None = None, save_every: float = 60.0
+) -> list[Result]:
     """One replicate, or many in step: an agent learns, adapts or plans, each in its way, on broken robots.
 
     Args:
         agent: Acts on all the robots.
         tasks: The test robots; the seed of the first is the agent's.
         steps: Of each robot.
+        saved: The file of an agent's life, which goes on from there and is saved there; a PPO's is not.
+        save_every: Seconds between two savings at least; it waits for the end of an episode.
     """
-    envs: list[Monitor[Any, Any]] = [Monitor(task.make()) for task in tasks]
-    agent.set_env(DummyVecEnv([partial(_itself, env) for env in envs]))
+    robots = [Repeatable(task.make()) for task in tasks]
+    envs: list[Monitor[Any, Any]] = [Monitor(robot) for robot in robots]
+    vec_env = DummyVecEnv([partial(_itself, env) for env in envs])
+    agent.set_env(vec_env)
     agent.set_random_seed(tasks[0].seed)
-    start = time.perf_counter()
-    agent.learn(steps * len(envs))
-    seconds = time.perf_counter() - start
-    results = [
-        {
-            "situation": str(task.situation),
-            "returns": [round(value, 3) for value in env.get_episode_rewards()],
-            "lengths": env.get_episode_lengths(),
-            "seconds_per_step": seconds / sum(env.get_total_steps() for env in envs),
-        }
-        for task, env in zip(tasks, envs, strict=True)
-    ]
-    for env in envs:
-        env.close()
-    return results
+    history = History([[] for _ in tasks], [[] for _ in tasks])
+    if saved is not None and isinstance(agent, ModelBasedAgent) and (earlier := read_life(saved, agent)) is not None:
+        history = earlier
+        for robot, state in zip(robots, history.random, strict=True):
+            robot.begin_with(state)
+    historian = _Historian(history, envs, saved, save_every)
+    if (missing := steps - history.steps) > 0:
+        agent.learn(missing * len(envs), callback=historian)
+    vec_env.close()
+    return [_result(task, historian.history, i, steps) for i, task in enumerate(tasks)]
+
+
+class _Historian(BaseCallback):
+    """Notes what robots go through, and saves it at the end of an episode of all of them."""
+
+    def __init__(
+        self, earlier: History, envs: Sequence[Monitor[Any, Any]], saved: Path | None, save_every: float
+    ) -> None:
+        super().__init__()
+        self._earlier, self._envs, self._saved, self._save_every = earlier, envs, saved, save_every
+        self._start = self._saved_at = time.perf_counter()
+
+    @property
+    def history(self) -> History:
+        """All until now."""
+        episodes = zip(self._earlier.returns, self._earlier.lengths, self._envs, strict=True)
+        returns, lengths = zip(
+            *(([*r, *env.get_episode_rewards()], [*n, *env.get_episode_lengths()]) for r, n, env in episodes),
+            strict=True,
+        )
+        seconds = self._earlier.seconds + time.perf_counter() - self._start
+        return History(returns, lengths, seconds, [env.get_wrapper_attr("began_with") for env in self._envs])
+
+    def _on_step(self) -> bool:
+        due = time.perf_counter() - self._saved_at >= self._save_every
+        if self._saved is not None and isinstance(self.model, ModelBasedAgent) and due and self.locals["dones"].all():
+            write_life(self._saved, self.model, self.history)
+            self._saved_at = time.perf_counter()
+        return True
+
+
+def _result(task: Task, history: History, i: int, steps: int) -> Result:
+    """What is stored of a robot: its whole episodes within some steps."""
+    lengths = history.lengths[i]
+    whole = int(np.searchsorted(np.cumsum(lengths), steps, side="right"))
+    return {
+        "situation": str(task.situation),
+        "returns": [round(value, 3) for value in history.returns[i][:whole]],
+        "lengths": list(lengths[:whole]),
+        "seconds_per_step": history.seconds / sum(map(sum, history.lengths)),
+    }
 
 
 def _itself(env: Monitor[Any, Any]) -> Monitor[Any, Any]:

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -25,6 +25,7 @@ __all__ = [
     "Replicate",
     "ReplicateError",
     "Result",
+    "commit",
     "is_stored",
     "load_results",
     "provenance",
@@ -57,6 +58,14 @@ class Options:
     """Folder of the results."""
     cache: Path = Path("runs/agents")
     """Folder of the agents that are learnt in simulation."""
+    lives: Path = Path("runs/lives")
+    """Folder of long replicates on their way, which go on from there."""
+    in_step: int = 30
+    """Replicates of one method that act in step at most, where its robots can do that."""
+
+    def life(self, experiment: str, method: str, seeds: Sequence[int]) -> Path:
+        """The file of the life of robots in step."""
+        return self.lives / experiment / f"{method}-{seeds[0]}-of-{len(seeds)}.zip"
 
 
 @dataclass(frozen=True)
@@ -150,12 +159,17 @@ def load_results(folder: Path) -> list[Result]:
 
 def provenance(argv: list[str]) -> Result:
     """What it takes to run something again: command, commit and versions."""
-    commit = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False)
     return {
         "command": " ".join(_command(argv)),
-        "commit": commit.stdout.strip() or "unknown",
+        "commit": commit(),
         "versions": {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES},
     }
+
+
+def commit() -> str:
+    """What git calls the code in the working folder, "-dirty" where it was changed since; "unknown" without git."""
+    described = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False)
+    return described.stdout.strip() or "unknown"
 
 
 def write_json(path: Path, value: Any) -> None:

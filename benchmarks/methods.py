@@ -79,6 +79,18 @@ class Method:
     learn: Callable[[Task], object] = lambda task: None
     fleet: Callable[[Sequence[Task]], ModelBasedAgent] | None = None
 
+    def on(self, tasks: Sequence[Task]) -> BaseAlgorithm:
+        """The agent of one test robot, or of many in step.
+
+        Raises:
+            ValueError: The robots of this method run one by one.
+        """
+        if len(tasks) == 1:
+            return self.agent(tasks[0])
+        if self.fleet is None:
+            raise ValueError(f"The replicates of this method run one by one, not {len(tasks)} in step.")
+        return self.fleet(tasks)
+
 
 # --- FAMLE ------------------------------------------------------------------------------------------------------------
 
@@ -179,7 +191,10 @@ class MetaTrained:
         Raises:
             ValueError: Robots would go back to a network that is not theirs.
         """
-        agent, many = self.agent(tasks[0]), self.cls.load(self.learn(tasks[0]), device="cpu")._require_dynamics()
+        agent = self.agent(tasks[0])
+        if _is_shipped(tasks[0].robot):
+            return agent
+        many = self.cls.load(self.learn(tasks[0]), device="cpu")._require_dynamics()
         if not agent.hyperparameters.keep_adapting:
             raise ValueError(f"The robots of {self.name} do not keep their networks; run them one by one.")
         rows = torch.tensor([task.seed % self.networks for task in tasks])

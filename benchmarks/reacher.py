@@ -50,18 +50,16 @@ def situation_of(damage: str, seed: int) -> Situation:
     return ReacherEnv.sample_situation(np.random.default_rng([2020, seed]), n_faults=2)
 
 
+def run_fleet(method: str, tasks: Sequence[Task], args: Args) -> list[Result]:
+    """One replicate, or many in step."""
+    steps = args.ppo_steps if method in PPO_METHODS else args.steps
+    life = args.life(f"reacher-{args.damage}", method, [task.seed for task in tasks])
+    return curves.run(METHODS[method].on(tasks), tasks, steps, life)
+
+
 def run(method: str, task: Task, args: Args) -> Result:
     """One replicate."""
-    steps = args.ppo_steps if method in PPO_METHODS else args.steps
-    return curves.run(METHODS[method].agent(task), [task], steps)[0]
-
-
-def run_fleet(method: str, tasks: Sequence[Task], args: Args) -> list[Result]:
-    """All replicates of a method in step."""
-    fleet = METHODS[method].fleet
-    if fleet is None:
-        raise ValueError(f"The replicates of {method} run one by one.")
-    return curves.run(fleet(tasks), tasks, args.steps)
+    return run_fleet(method, [task], args)[0]
 
 
 def main(args: Args) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -249,22 +248,15 @@ def descend(
     """
     if inner_loop.steps == 0:
         return start
-    data = model.encode(memory.obs, memory.action, memory.next_obs, memory.weight)
-    data = Batch(*(values.repeat_interleave(model.members, dim=0) for values in (data.x, data.y, data.weight)))
-    seen, newest = _split(data, validation_size)
-    theta, h, _ = inner_loop(model, start.theta, start.h, partial(sample, seen))
+    seen, newest = memory.split(validation_size)
+    theta, h, _ = inner_loop(model, start.theta, start.h, sample(model, seen))
     if validation_size:
-        better = model.loss(theta, h, newest) < model.loss(start.theta, start.h, newest)
+        batch = whole_memory(model, newest)()
+        better = model.loss(theta, h, batch) < model.loss(start.theta, start.h, batch)
         theta = {name: _choose(better, value, start.theta[name]) for name, value in theta.items()}
         h = _choose(better, h, start.h)
     adapted = replace(start, theta=theta, h=h)
     return adapted.where(adapted.is_finite(), start)  # steps that diverged are no steps
-
-
-def _split(data: Batch, newest: int) -> tuple[Batch, Batch]:
-    """The transitions without the newest ones, and these."""
-    is_new = torch.arange(data.weight.shape[1], device=data.weight.device) >= data.weight.shape[1] - newest
-    return replace(data, weight=data.weight * ~is_new), replace(data, weight=data.weight * is_new)
 
 
 def _choose(rows: Tensor, mine: Tensor, theirs: Tensor) -> Tensor:

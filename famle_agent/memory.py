@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from famle_agent.dynamics import Batch
+from famle_agent.dynamics import Batch, Dynamics
 
-__all__ = ["Memory", "Sample", "minibatches", "whole_memory"]
+__all__ = ["Draw", "Memory", "Sample", "minibatches", "whole_memory"]
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,11 @@ class Memory:
         nothing = low > high
         return low.masked_fill(nothing, -math.inf), high.masked_fill(nothing, math.inf)
 
+    def split(self, newest: int) -> tuple[Memory, Memory]:
+        """The same transitions without the newest ones, and with these alone; the others weigh nothing."""
+        is_new = torch.arange(self.weight.shape[1], device=self.weight.device) >= self.weight.shape[1] - newest
+        return replace(self, weight=self.weight * ~is_new), replace(self, weight=self.weight * is_new)
+
     def resized(self, size: int) -> Memory:
         """The newest ``size`` places, with empty ones in front where there are fewer."""
 
@@ -67,10 +72,11 @@ class Memory:
 
     def add(self, obs: Tensor, action: Tensor, next_obs: Tensor, log_p: Tensor, valid: Tensor) -> Memory:
         """Inserts one transition per robot where ``valid`` (B,), and drops that robot's oldest."""
+        everywhere = bool(valid.all())  # as nearly always; a second copy of a large memory is worth avoiding
 
         def push(old: Tensor, new: Tensor) -> Tensor:
             moved = torch.cat([old[:, 1:], new[:, None]], dim=1)
-            return torch.where(valid.view(-1, *[1] * (old.ndim - 1)), moved, old)
+            return moved if everywhere else torch.where(valid.view(-1, *[1] * (old.ndim - 1)), moved, old)
 
         return Memory(
             push(self.obs, obs),
@@ -81,24 +87,35 @@ class Memory:
         )
 
 
-Sample = Callable[[Batch], Batch]
-"""Chooses the transitions of a gradient step."""
+Draw = Callable[[], Batch]
+"""Gives the normalised transitions of the next gradient step, a row for each member of each robot, (B * P, n, ...)."""
+
+Sample = Callable[[Dynamics, Memory], Draw]
+"""Says what gradient steps on a model see of a memory."""
 
 
-def whole_memory(data: Batch) -> Batch:
+def whole_memory(model: Dynamics, memory: Memory) -> Draw:
     """All transitions in each step, as in the paper."""
-    return data
+    data = model.encode(memory.obs, memory.action, memory.next_obs, memory.weight)
+    batch = Batch(*(values.repeat_interleave(model.members, dim=0) for values in (data.x, data.y, data.weight)))
+    return lambda: batch
 
 
 def minibatches(size: int, generator: torch.Generator) -> Sample:
     """Transitions drawn anew for each step, ``size`` of each row, with repetitions."""
 
-    def sample(data: Batch) -> Batch:
-        chance = torch.rand(len(data.weight), size, generator=generator, device=generator.device)
-        nth = (chance.to(data.weight.device) * data.weight.sum(dim=1, keepdim=True)).floor()
-        # Of the transitions that count, the nth is where their running number passes n.
-        i = torch.searchsorted(data.weight.cumsum(dim=1), nth, right=True).clamp(max=data.weight.shape[1] - 1)
-        rows = torch.arange(len(i), device=i.device)[:, None]
-        return Batch(data.x[rows, i], data.y[rows, i], data.weight[rows, i])
+    def sample(model: Dynamics, memory: Memory) -> Draw:
+        rows = torch.arange(len(memory.weight), device=memory.weight.device).repeat_interleave(model.members)[:, None]
+        running_number = memory.weight.cumsum(dim=1)[rows[:, 0]]
+
+        def draw() -> Batch:
+            chance = torch.rand(len(rows), size, generator=generator, device=generator.device).to(rows.device)
+            nth = (chance * running_number[:, -1:]).floor()
+            # Of the transitions that count, the nth is where their running number passes n.
+            i = torch.searchsorted(running_number, nth, right=True).clamp(max=memory.weight.shape[1] - 1)
+            drawn = (values[rows, i] for values in (memory.obs, memory.action, memory.next_obs, memory.weight))
+            return model.encode(*drawn)
+
+        return draw
 
     return sample

@@ -15,7 +15,7 @@ from famle_agent import FAMLE, Transitions
 from famle_agent.adaptation import Belief, Candidates, adapt, descend, prior, select, window_posterior
 from famle_agent.dynamics import Batch, Dynamics
 from famle_agent.inner_loop import InnerLoop
-from famle_agent.memory import Memory, minibatches, whole_memory
+from famle_agent.memory import Memory, Sample, minibatches, whole_memory
 from tests.helpers import adapted, memory_of
 
 INNER_LOOP = InnerLoop(steps=10, lr=1e-3, embedding_lr=0.05, optimizer="adam")
@@ -126,45 +126,84 @@ def test_memory_knows_how_much_it_has_seen_and_how_far_it_went(valid: list[list[
 # --- what a gradient step sees ----------------------------------------------------------------------------
 
 
-def numbered(weight: Tensor) -> Batch:
-    """Transitions that say which they are."""
-    x = torch.arange(weight.numel(), dtype=torch.float32).view(*weight.shape, 1)
-    return Batch(x, -x, weight)
+def numbered(weight: Tensor) -> Memory:
+    """Transitions whose observations say which they are."""
+    obs = torch.arange(weight.numel(), dtype=torch.float32).view(*weight.shape, 1)
+    return Memory(obs, torch.zeros_like(obs), obs + 1.0, torch.zeros_like(obs), weight)
+
+
+def model_of(members: int = 1) -> Dynamics:
+    """A model that sees observations as they are."""
+    return Dynamics(obs_dim=1, action_dim=1, n_situations=1, members=members)
+
+
+def numbers(batch: Batch) -> Tensor:
+    """Which transitions there are in a batch, (rows, n)."""
+    return batch.x[..., 0]
 
 
 weights = st.lists(st.lists(st.booleans(), min_size=6, max_size=6), min_size=1, max_size=3)
 
 
-@given(weights, st.integers(1, 8), st.integers(0, 99))
-def test_minibatch_holds_what_counts_of_each_row(rows: list[list[bool]], size: int, seed: int) -> None:
-    data = numbered(torch.tensor(rows, dtype=torch.float32))
-    drawn = minibatches(size, torch.Generator().manual_seed(seed))(data)
-    assert drawn.x.shape == drawn.y.shape == (len(rows), size, 1)
-    assert torch.equal(drawn.y, -drawn.x)
-    for row, weight in enumerate(data.weight):
-        if weight.any():
-            assert (drawn.weight[row] == 1).all()
-            assert set(drawn.x[row].flatten().tolist()) <= set(data.x[row, weight == 1].flatten().tolist())
+@given(weights, st.integers(1, 8), st.integers(1, 2), st.integers(0, 99))
+def test_minibatch_holds_what_counts_of_each_robot(
+    robots: list[list[bool]], size: int, members: int, seed: int
+) -> None:
+    memory = numbered(torch.tensor(robots, dtype=torch.float32))
+    batch = minibatches(size, torch.Generator().manual_seed(seed))(model_of(members), memory)()
+    drawn = numbers(batch)
+    assert drawn.shape == (len(robots) * members, size)
+    assert (batch.y == 1.0).all()
+    for row in range(len(drawn)):
+        counted = memory.obs[row // members, memory.weight[row // members] == 1]
+        if len(counted):
+            assert (batch.weight[row] == 1).all()
+            assert set(drawn[row].tolist()) <= set(counted.flatten().tolist())
         else:
-            assert (drawn.weight[row] == 0).all()  # nothing that could be learnt from
+            assert (batch.weight[row] == 0).all()  # nothing that could be learnt from
 
 
 @given(weights)
-def test_all_that_counts_is_drawn_as_often(rows: list[list[bool]]) -> None:
-    data = numbered(torch.tensor(rows, dtype=torch.float32))
-    drawn = minibatches(3000, torch.Generator().manual_seed(0))(data)
-    for row, weight in enumerate(data.weight):
-        counts = torch.bincount(drawn.x[row].flatten().long() - 6 * row, minlength=6) * drawn.weight[row].mean()
+def test_all_that_counts_is_drawn_as_often(robots: list[list[bool]]) -> None:
+    memory = numbered(torch.tensor(robots, dtype=torch.float32))
+    batch = minibatches(3000, torch.Generator().manual_seed(0))(model_of(), memory)()
+    for row, weight in enumerate(memory.weight):
+        counts = torch.bincount(numbers(batch)[row].long() - 6 * row, minlength=6) * batch.weight[row].mean()
         torch.testing.assert_close(counts, 3000 * weight / weight.sum().clamp(min=1), rtol=0.2, atol=0.0)
 
 
 def test_rows_and_steps_draw_by_themselves() -> None:
-    data, sample = numbered(torch.ones(2, 50)), minibatches(20, torch.Generator().manual_seed(0))
-    one, other = sample(data), sample(data)
-    assert not torch.equal(one.x[0], one.x[1] - 50)
-    assert not torch.equal(one.x, other.x)
-    assert torch.equal(minibatches(20, torch.Generator().manual_seed(0))(data).x, one.x)
-    assert whole_memory(data) is data
+    memory = numbered(torch.ones(2, 50))
+
+    def draws(members: int = 1) -> Callable[[], Batch]:
+        return minibatches(20, torch.Generator().manual_seed(0))(model_of(members), memory)
+
+    draw, again = draws(), draws()
+    one, other = numbers(draw()), numbers(draw())
+    assert not torch.equal(one[0], one[1] - 50)
+    assert not torch.equal(one, other)
+    assert torch.equal(numbers(again()), one)
+    of_members = numbers(draws(members=2)())
+    assert not torch.equal(of_members[0], of_members[1])
+
+
+def test_whole_memory_is_what_each_member_sees_each_time() -> None:
+    memory = numbered(torch.tensor([[0.0, 1.0, 1.0], [1.0, 1.0, 1.0]]))
+    draw = whole_memory(model_of(members=2), memory)
+    batch = draw()
+    assert torch.equal(numbers(batch), memory.obs[[0, 0, 1, 1], :, 0])
+    assert torch.equal(batch.weight, memory.weight[[0, 0, 1, 1]])
+    assert draw() is batch
+
+
+@given(weights, st.integers(0, 6))
+def test_newest_transitions_are_split_off(robots: list[list[bool]], newest: int) -> None:
+    memory = numbered(torch.tensor(robots, dtype=torch.float32))
+    older, newer = memory.split(newest)
+    assert torch.equal(older.weight + newer.weight, memory.weight)
+    assert (older.weight[:, 6 - newest :] == 0).all()
+    assert (newer.weight[:, : 6 - newest] == 0).all()
+    assert torch.equal(older.obs, memory.obs)
 
 
 # --- the most likely situation ----------------------------------------------------------------------------
@@ -220,7 +259,7 @@ def test_adaptation_is_selection_and_descent(
     memory, start = memory_of(model, candidates, *tensors_of(held_out)), prior(model, candidates, 11)
     belief = replace(start, log_posterior=window_posterior(candidates, memory))
 
-    def sample() -> Callable[[Batch], Batch]:
+    def sample() -> Sample:
         return minibatches(8, torch.Generator().manual_seed(1))
 
     whole = adapt(model, candidates, memory, INNER_LOOP, belief, validation_size, spread, sample())

@@ -13,7 +13,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from benchmarks import curves, methods, reacher
+from benchmarks import curves, lives, methods, reacher
 from benchmarks.compare import compare
 from benchmarks.harness import Options, ReplicateError, Result, load_results
 from benchmarks.methods import METHODS, PPO_METHODS, MetaTrained, Method, Task
@@ -226,6 +226,12 @@ def test_robots_that_would_go_back_to_another_network_are_refused(tmp_path: Path
 # --- learning curves --------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def code(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Says which commit the code is of."""
+    return lambda name: monkeypatch.setattr(lives, "commit", lambda: name)
+
+
 def test_same_task_same_curve(cache: Path) -> None:
     runs = [curves.run(METHODS["ampc"].agent(task_of(seed, cache)), [task_of(seed, cache)], 15) for seed in (0, 0, 1)]
     (one,), (same,), (other,) = ([result["returns"] for result in run] for run in runs)
@@ -240,8 +246,69 @@ def test_robots_in_step_have_damages_and_curves_of_their_own(cache: Path) -> Non
     assert [result["situation"] for result in results] == ["joint 3 dead", "joint 0 reversed"]
     assert all(result["lengths"] == [EPISODE] * 2 for result in results)
     assert results[0]["returns"] != results[1]["returns"]
-    with pytest.raises(ValueError, match="replicates of famle run one by one"):
+    with pytest.raises(ValueError, match="run one by one, not 2 in step"):
         reacher.run_fleet("famle", tasks, reacher.Args(steps=2))
+
+
+@pytest.mark.parametrize(
+    ("method", "robots"), [("famle", 1), ("famle-original", 1), ("famle-paper", 1), ("ampc", 2), ("ampc-reptile", 2)]
+)
+def test_interrupted_life_ends_as_if_nothing_had_happened(
+    method: str, robots: int, cache: Path, tmp_path: Path, code: Callable[[str], None]
+) -> None:
+    code("1a2b3c4")
+    tasks, life = [task_of(seed, cache) for seed in range(robots)], tmp_path / "life.zip"
+
+    def returns(episodes: int, saved: Path | None) -> list[list[float]]:
+        results = curves.run(METHODS[method].on(tasks), tasks, episodes * EPISODE, saved, save_every=0.0)
+        assert all(result["lengths"] == [EPISODE] * episodes for result in results)
+        return [result["returns"] for result in results]
+
+    whole = returns(5, None)
+    assert returns(2, life) == [robot[:2] for robot in whole]
+    assert returns(5, life) == whole
+    assert returns(4, life) == [robot[:4] for robot in whole]
+
+
+def test_long_life_is_not_lived_again(cache: Path, tmp_path: Path, code: Callable[[str], None]) -> None:
+    code("1a2b3c4")
+    task, life = task_of(0, cache), tmp_path / "life.zip"
+    (long,) = curves.run(METHODS["famle"].agent(task), [task], 2 * EPISODE, life, save_every=0.0)
+    (short,) = curves.run(METHODS["famle"].agent(task), [task], EPISODE, life, save_every=0.0)
+    assert short["returns"] == long["returns"][:1]
+    assert short["seconds_per_step"] == pytest.approx(long["seconds_per_step"], rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("before", "after"), [("1a2b3c4", "5d6e7f8"), ("1a-dirty", "1a-dirty"), ("unknown", "unknown")]
+)
+def test_life_of_other_code_begins_anew(
+    before: str, after: str, cache: Path, tmp_path: Path, code: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task, life = task_of(0, cache), tmp_path / "life.zip"
+    code(before)
+    curves.run(METHODS["famle"].agent(task), [task], EPISODE, life, save_every=0.0)
+    assert life.exists()
+    code(after)
+    lived: list[int] = []
+    learn = ModelBasedAgent.learn
+    monkeypatch.setattr(
+        ModelBasedAgent, "learn", lambda self, steps, **more: (lived.append(steps), learn(self, steps, **more))[1]
+    )
+    curves.run(METHODS["famle"].agent(task), [task], 2 * EPISODE, life)
+    assert lived == [2 * EPISODE]
+
+
+def test_ppo_is_not_saved_on_its_way(cache: Path, tmp_path: Path) -> None:
+    task, life = task_of(0, cache), tmp_path / "life.zip"
+    curves.run(METHODS["ppo"].agent(task), [task], 2 * EPISODE, life, save_every=0.0)
+    assert not life.exists()
+
+
+def test_life_is_saved_now_and_then(cache: Path, tmp_path: Path) -> None:
+    task, life = task_of(0, cache), tmp_path / "life.zip"
+    curves.run(METHODS["famle"].agent(task), [task], 2 * EPISODE, life)
+    assert not life.exists()  # not a minute has passed
 
 
 def test_test_robot_is_broken_as_the_task_says(cache: Path) -> None:
@@ -284,10 +351,11 @@ def play(calls: list[str], tmp_path: Path) -> Callable[..., Path]:
         calls.append(f"{method} {[task.seed for task in tasks]}")
         return [{"value": task.seed} for task in tasks]
 
-    def compared(names: Sequence[str], seeds: Sequence[int], in_step: bool = True) -> Path:
+    def compared(names: Sequence[str], seeds: Sequence[int], in_step: int = 30) -> Path:
         tasks = [task_of(seed, tmp_path) for seed in seeds]
         folder = tmp_path / "results"
-        compare(names, tasks, run, folder, Options(jobs=1), known, run_fleet if in_step else None)
+        options = Options(jobs=1, in_step=in_step)
+        compare(names, tasks, run, folder, options, known, run_fleet if in_step else None)
         return folder
 
     return compared
@@ -318,8 +386,11 @@ def test_robots_act_in_step_where_method_and_benchmark_can(play: Callable[..., P
         *((0, 0, 2), (1, 1, 2)),
     ]
     calls.clear()
-    play(["fleet"], [2, 3], in_step=False)
+    play(["fleet"], [2, 3], in_step=0)
     assert calls == ["fleet learns", "fleet 2", "fleet 3"]
+    calls.clear()
+    play(["fleet"], [4, 5, 6], in_step=2)
+    assert calls == ["fleet learns", "fleet [4, 5]", "fleet [6]"]
 
 
 def test_unknown_method_is_refused_before_anything_runs(play: Callable[..., Path], calls: list[str]) -> None:
