@@ -100,7 +100,8 @@ def _write_quartiles(study: Study, method: str, folder: Path) -> None:
 def _scores(study: Study, run: Result) -> dict[str, float]:
     """The metrics that this kind of experiment has; TensorBoard leaves the others blank."""
     names = {"return": "first_episode"}
-    scores = {f"score/{names.get(measure.key, measure.key)}": measure.score(run) for measure in study.measures}
+    measures = [measure for measure in study.measures if study.has(run["method"], measure)]
+    scores = {f"score/{names.get(measure.key, measure.key)}": measure.score(run) for measure in measures}
     if study.experiment.kind == "curves":
         solved = solved_at(run["returns"], run["lengths"], study.experiment.threshold)
         scores |= {} if solved is None else {"score/solved_at": float(solved)}

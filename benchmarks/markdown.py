@@ -80,8 +80,8 @@ them.""",
 _NOTES: Mapping[Kind, str] = {
     "curves": """Solved: three returns in a row above {study.experiment.threshold:g}, counted at the end of the first of
 them; a replicate that never gets there is infinite in the median. Methods are compared over the first {study.steps:,}
-robot steps, which all replicates have; *solved at* and *first crossing* are over all steps of a method. The time of a
-step contains the simulated robot and all learning on the way.""",
+robot steps, but for those of which the title says that they have fewer; *solved at* and *first crossing* are over all
+steps of a method. The time of a step contains the simulated robot and all learning on the way.""",
     "episode": "The time is the median of a control step, with adaptation.",
     "gaits": """Steps are the gaits of the runs that reach the goal, within {study.experiment.budget}. A gait takes a
 second; the paper's took about two. The time of a plan is without adaptation.""",
@@ -204,10 +204,14 @@ def _together(row: Row) -> str:
 
 
 def _spread(row: Row, key: str) -> str:
+    if f"{key}_median" not in row:
+        return "-"
     return "{} ({} to {})".format(*(_decimals(row, key, name) for name in ("median", "low", "high")))
 
 
 def _interval(row: Row, key: str) -> str:
+    if f"{key}_iqm" not in row:
+        return "-"
     return "{} [{}, {}]".format(*(_decimals(row, key, name) for name in ("iqm", "iqm_low", "iqm_high")))
 
 
@@ -217,6 +221,8 @@ def _of_oracle(row: Row, key: str) -> str:
 
 
 def _better(row: Row, key: str) -> str:
+    if f"{key}_famle_better" not in row:
+        return "-"
     return "{:.2f} [{:.2f}, {:.2f}]".format(*(row[f"{key}_famle_better{suffix}"] for suffix in ("", "_low", "_high")))
 
 
@@ -238,7 +244,7 @@ def _better_than_famle(study: Study, rows: Sequence[Row]) -> str:
     """Who wins against FAMLE in what, so that nobody has to search for it."""
     wins = []
     for measure in study.measures:
-        winners = [row["label"] for row in rows if row[f"{measure.key}_famle_better_high"] < 0.5]
+        winners = [row["label"] for row in rows if row.get(f"{measure.key}_famle_better_high", 1.0) < 0.5]
         if winners:
             wins.append(f"{' / '.join(winners)} ({measure.label})")
     return f"Better than FAMLE, the whole interval below one half: {'; '.join(wins) or 'none'}."

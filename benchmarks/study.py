@@ -16,7 +16,10 @@ from benchmarks.registry import Experiment, Kind
 from benchmarks.statistics import Array, quartiles
 from benchmarks.summaries import by_method
 
-__all__ = ["ROBOT_ALONE", "Measure", "Study", "quartiles_over_steps", "read_study"]
+__all__ = ["ROBOT_ALONE", "SUBJECT", "Measure", "Study", "quartiles_over_steps", "read_study"]
+
+SUBJECT = "famle"
+"""The method that all others are compared with."""
 
 ROBOT_ALONE = "robot alone"
 """The raw cost of a control step among the times that were measured in one run."""
@@ -39,12 +42,14 @@ class Measure:
         label: Its name for people.
         score: The figure of a stored replicate.
         higher_is_better: Whether more is better.
+        steps: Robot steps that a replicate must have for it.
     """
 
     key: str
     label: str
     score: Callable[[Result], float]
     higher_is_better: bool = True
+    steps: int = 0
 
 
 @dataclass(frozen=True)
@@ -62,19 +67,29 @@ class Study:
     step_times: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
+    def lived(self) -> Mapping[str, int]:
+        """The robot steps in whole episodes that all replicates of a method have; of learning curves alone."""
+        return {method: min(int(sum(run["lengths"])) for run in runs) for method, runs in self.runs.items()}
+
+    @cached_property
     def steps(self) -> int:
-        """The robot steps that all replicates of all methods have in whole episodes; of learning curves alone."""
-        return min(sum(run["lengths"]) for runs in self.runs.values() for run in runs)
+        """The robot steps over which methods are compared: FAMLE's, without FAMLE those that all methods have."""
+        return self.lived.get(SUBJECT) or min(self.lived.values())
+
+    def has(self, method: str, measure: Measure) -> bool:
+        """Whether the replicates of a method have lived for long enough to be measured so."""
+        return not measure.steps or self.lived[method] >= measure.steps
 
     @cached_property
     def measures(self) -> tuple[Measure, ...]:
         """What the methods are compared by, the first one first."""
         limit = self.experiment.budget
         if self.experiment.kind == "curves":
+            at = f"{self.steps:,} robot steps"
             return (
                 Measure("first_episode", "return of the first episode", lambda run: float(run["returns"][0])),
-                Measure("mean_return", f"mean return over {self.steps:,} robot steps", self._mean_return),
-                Measure("last_episode", f"return of the episode at {self.steps:,} robot steps", self._last_return),
+                Measure("mean_return", f"mean return over {at}", self._mean_return, steps=self.steps),
+                Measure("last_episode", f"return of the episode at {at}", self._last_return, steps=self.steps),
             )
         if self.experiment.kind == "episode":
             return (Measure("return", "return of the first episode", lambda run: float(run["return"])),)
@@ -89,6 +104,8 @@ class Study:
 
     def of_oracle(self, method: str, measure: Measure) -> tuple[Array, Array] | None:
         """A figure of a method and of the oracle over the seeds that both have, each (n,); None without such seeds."""
+        if "oracle" in self.runs and not self.has("oracle", measure):
+            return None
         ours, oracle = ({run["seed"]: run for run in self.runs.get(name, ())} for name in (method, "oracle"))
         if not (shared := ours.keys() & oracle.keys()):
             return None
@@ -142,6 +159,8 @@ class Study:
             longest = max(max(run["lengths"]) for runs in self.runs.values() for run in runs)
             if self.steps + longest <= self.experiment.budget:
                 parts.append(f"{self.steps:,} robot steps instead of {self.experiment.budget:,}")
+            short = {method: steps for method, steps in self.lived.items() if steps < self.steps}
+            parts += [f"{steps:,} robot steps of {look(method).label}" for method, steps in short.items()]
         return f"{self.experiment.title}: {'; '.join(parts)}"
 
     @property

@@ -21,15 +21,12 @@ from benchmarks.statistics import (
     quartiles,
     solved_at,
 )
-from benchmarks.study import ROBOT_ALONE, Measure, Study
+from benchmarks.study import ROBOT_ALONE, SUBJECT, Measure, Study
 
-__all__ = ["SUBJECT", "Row", "figures", "replicates", "to_csv"]
+__all__ = ["Row", "figures", "replicates", "to_csv"]
 
 Row = dict[str, Any]
 """A row of a table by the names of its columns; None where there is nothing to say."""
-
-SUBJECT = "famle"
-"""The method that all others are compared with."""
 
 
 def figures(study: Study) -> list[Row]:
@@ -37,11 +34,12 @@ def figures(study: Study) -> list[Row]:
     rows = []
     for method, runs in study.runs.items():
         row: Row = {"method": method, "label": look(method).label, "replicates": len(runs)}
-        for measure in study.measures:
+        measures = [measure for measure in study.measures if study.has(method, measure)]
+        for measure in measures:
             row |= _spread(study, method, measure)
-        row |= _KINDS[study.experiment.kind](study, runs)
+        row |= _KINDS[study.experiment.kind](study, method)
         row |= _times(study, method)
-        for measure in study.measures:
+        for measure in measures:
             row |= _improvement(study, method, measure)
         rows.append(row | _published(study, look(method).paper))
     shown = {look(method).paper for method in study.runs}
@@ -104,7 +102,7 @@ def _times(study: Study, method: str) -> Row:
 
 def _improvement(study: Study, method: str, measure: Measure) -> Row:
     """The probability that a replicate of FAMLE is better than one of another method."""
-    if method == SUBJECT or SUBJECT not in study.runs:
+    if method == SUBJECT or SUBJECT not in study.runs or not study.has(SUBJECT, measure):
         return {}
     sign = 1.0 if measure.higher_is_better else -1.0
     ours, theirs = (sign * study.scores(name, measure) for name in (SUBJECT, method))
@@ -112,27 +110,30 @@ def _improvement(study: Study, method: str, measure: Measure) -> Row:
     return dict(zip(names, probability_of_improvement(ours, theirs), strict=True))
 
 
-def _curves(study: Study, runs: Sequence[Result]) -> Row:
-    threshold = study.experiment.threshold
+def _curves(study: Study, method: str) -> Row:
+    threshold, runs = study.experiment.threshold, study.runs[method]
     solved = _solved_at(study, runs)
     early = [_within(run, study.steps) for run in runs]
     second = [run["returns"][1] for run in runs if len(run["returns"]) > 1]
-    return {
+    row: Row = {
         "second_episode_median": np.median(second) if second else None,
-        "robot_steps": min(sum(run["lengths"]) for run in runs),
-        "solved_in_common_steps": sum(solved_at(*run, threshold) is not None for run in early),
+        "robot_steps": study.lived[method],
         "solved": sum(step is not None for step in solved),
         "solved_at": median_steps(solved),
         "famle_faster_by": _famle_faster_by(study, runs),
         "first_crossing": median_steps([first_crossing(run["returns"], run["lengths"], threshold) for run in runs]),
     }
+    if study.lived[method] >= study.steps:
+        row["solved_in_common_steps"] = sum(solved_at(*run, threshold) is not None for run in early)
+    return row
 
 
-def _episode(study: Study, runs: Sequence[Result]) -> Row:
-    return {"solved": sum(run["return"] > study.experiment.threshold for run in runs)}
+def _episode(study: Study, method: str) -> Row:
+    return {"solved": sum(run["return"] > study.experiment.threshold for run in study.runs[method])}
 
 
-def _gaits(study: Study, runs: Sequence[Result]) -> Row:
+def _gaits(study: Study, method: str) -> Row:
+    runs = study.runs[method]
     gaits = [run["gaits"] for run in runs if run["reached"]]
     return {
         "success": len(gaits) / len(runs),
@@ -141,7 +142,8 @@ def _gaits(study: Study, runs: Sequence[Result]) -> Row:
     }
 
 
-def _distance(study: Study, runs: Sequence[Result]) -> Row:
+def _distance(study: Study, method: str) -> Row:
+    runs = study.runs[method]
     ways = [study.trace(run)[1] for run in runs]
     return {
         "furthest_median": np.median([way.max() for way in ways]),
@@ -150,7 +152,7 @@ def _distance(study: Study, runs: Sequence[Result]) -> Row:
     }
 
 
-_KINDS: Mapping[Kind, Callable[[Study, Sequence[Result]], Row]] = {
+_KINDS: Mapping[Kind, Callable[[Study, str], Row]] = {
     "curves": _curves,
     "episode": _episode,
     "gaits": _gaits,

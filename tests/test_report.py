@@ -169,6 +169,21 @@ def test_curves_are_compared_over_the_steps_that_all_have_and_long_budgets_are_t
     assert "200 robot steps instead of 1,000" in text
 
 
+def test_method_with_fewer_steps_is_compared_by_what_it_has(arm: Path) -> None:
+    store_curves(arm, "famle-paper", [[10.0, 35.0]] * 2)
+    text, out = report(arm)
+    row = by_name(out / "reacher-paper.csv")["famle-paper"]
+    assert (row["robot_steps"], row["first_episode_median"], row["first_episode_famle_better"]) == (
+        "100",
+        "10.0",
+        "1.0",
+    )
+    compared = ("mean_return_median", "last_episode_median", "mean_return_famle_better", "solved_in_common_steps")
+    assert [row[name] for name in compared] == [""] * 4
+    assert "100 robot steps of FAMLE, the paper's settings" in text
+    assert "mean return over 200 robot steps" in text
+
+
 def test_success_rate_and_gaits_stand_beside_the_paper_s(quadruped: Path) -> None:
     text, out = report(quadruped)
     ours, rival = rows_of(text, "FAMLE"), rows_of(text, "AMPC-MAML (Reptile)")[0]
