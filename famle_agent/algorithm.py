@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 
 from famle_agent.dynamics import Dynamics
-from famle_agent.envs import check_spaces, env_attribute, env_spec, make_env, planning_reward
+from famle_agent.envs import check_spaces, env_attribute, env_id, env_spec, make_env, planning_reward
 from famle_agent.errors import NotLearnedError
 from famle_agent.hyperparameters import Hyperparameters, robot_of
 from famle_agent.observation import DIMS, ObservationLayout
@@ -110,7 +110,7 @@ class ModelBasedAlgorithm(BaseAlgorithm):
         self._env_reward_fn: RewardFn | None = None
         if self.env is not None:
             self._describe_env(self.env)
-        robot = robot_of(self._env_spec["id"] if self._env_spec else None)
+        robot = robot_of(None if self.env is None else env_id(self.env))
         self.hyperparameters = robot.hyperparameters(mode, self._method(overrides), **{**self._implied, **overrides})
         self._reward_fn = reward_fn
         if self.env is not None:

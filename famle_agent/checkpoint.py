@@ -20,7 +20,7 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from famle_agent.envs import env_attribute, make_env
-from famle_agent.hyperparameters import Hyperparameters
+from famle_agent.hyperparameters import Hyperparameters, known_robots
 from famle_agent.observation import DIMS
 from famle_agent.online import OnlineState
 
@@ -142,6 +142,8 @@ def load_agent(
         situations = tuple(str(name) for name in list(meta["situations"]))
         settings = Hyperparameters.from_dict(meta["hyperparameters"]).to_dict()
         mode, seed, live = meta["mode"], meta["seed"], meta["live"]
+        if not any(mode in robot.modes for robot in known_robots().values()):
+            raise ValueError(f"no robot has a mode {mode!r}")
         dims = {name: tuple(meta.get(name, ())) for name in DIMS}
         needs_reward_fn, named_env = meta["needs_reward_fn"], meta["env"]
         env = _named_env(named_env) if env is None else env
@@ -155,8 +157,9 @@ def load_agent(
     if env is not None:
         env = make_env(env)
         _check_env(env, observation_space, action_space)
-    agent = cls(env, mode, reward_fn=reward_fn, device=device, pretrained=False, **{**settings, **dims, **overrides})
-    agent.situations, agent.seed = situations, seed
+    # All settings are in the file, so that its mode need not be known for this environment.
+    agent = cls(env, reward_fn=reward_fn, device=device, pretrained=False, **{**settings, **dims, **overrides})
+    agent.mode, agent.situations, agent.seed = mode, situations, seed
     if env is None:
         agent.observation_space, agent.action_space, agent.n_envs = observation_space, action_space, 1
     try:

@@ -26,6 +26,7 @@ __all__ = [
     "SituationEnvs",
     "check_spaces",
     "env_attribute",
+    "env_id",
     "env_spec",
     "make_env",
     "planning_reward",
@@ -68,6 +69,12 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
             )
     if not action_space.is_bounded("both"):  # type: ignore[attr-defined]
         raise ValueError(f"The action space must be bounded, got {action_space}; use gymnasium.wrappers.RescaleAction.")
+
+
+def env_id(env: VecEnv) -> str | None:
+    """The Gymnasium id of an environment, whatever wraps it; None where it was not registered."""
+    spec: EnvSpec | None = env.get_attr("spec")[0]
+    return None if spec is None else spec.id
 
 
 def env_spec(env: VecEnv) -> dict[str, Any] | None:

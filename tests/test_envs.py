@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -309,3 +310,17 @@ def test_spaces_that_no_model_predicts_are_refused(
 def test_discrete_actions_of_a_registered_environment_are_refused() -> None:
     with pytest.raises(ValueError, match="discrete actions are not supported"):
         FAMLE("CartPole-v1")
+
+
+@pytest.mark.parametrize("mode", ["paper", "original"])
+def test_wrapped_robot_has_the_settings_of_the_robot(make_env: MakeEnv, mode: str) -> None:
+    wrapped = FAMLE(gym.wrappers.TimeLimit(make_env(), 20), mode, device="cpu")
+    assert wrapped.hyperparameters == FAMLE("reacher", mode, device="cpu").hyperparameters
+
+
+def test_agent_of_a_wrapped_robot_is_loaded_with_and_without_it(make_env: MakeEnv, tmp_path: Path) -> None:
+    wrapped = FAMLE(gym.wrappers.TimeLimit(make_env(), 20), "original", device="cpu", candidates=7)
+    wrapped.save(tmp_path / "agent.zip")
+    for env in (None, gym.wrappers.TimeLimit(make_env(), 20)):
+        loaded = FAMLE.load(tmp_path / "agent.zip", env, device="cpu")
+        assert (loaded.mode, loaded.hyperparameters) == ("original", wrapped.hyperparameters)
