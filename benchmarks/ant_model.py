@@ -138,7 +138,7 @@ def learning_curve(agent: FAMLE, data: Transitions, seen: Sequence[int]) -> list
             if n:
                 obs, action, next_obs = (torch.as_tensor(v[:, :n]) for v in (data.obs, data.action, data.next_obs))
                 log_p = candidates.log_likelihood(model, model.encode(obs, action, next_obs))
-                memory = Memory(obs, action, next_obs, log_p, torch.ones(1, n))
+                memory = Memory.full(obs, action, next_obs, log_p)
                 belief = Belief(belief.theta, belief.h, window_posterior(candidates, memory))
                 belief = adapt(model, candidates, memory, inner_loop, belief)
             rows.append({"way": way, "seen": n, **errors(model, belief, data, max(seen))})

@@ -110,7 +110,7 @@ class Sines:
         x = 10.0 * torch.rand(len(self.phase), n, generator=generator) - 5.0
         obs, next_obs = x[..., None], (x + self(x))[..., None]
         nothing = torch.zeros(*x.shape, 0)
-        return Memory(obs, nothing, next_obs, log_p=nothing, weight=torch.ones_like(x))
+        return Memory.full(obs, nothing, next_obs, log_p=nothing)
 
 
 @dataclass(frozen=True)

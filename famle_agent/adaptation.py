@@ -21,6 +21,7 @@ __all__ = [
     "Belief",
     "Candidates",
     "adapt",
+    "better_explained",
     "descend",
     "filtered_posterior",
     "prior",
@@ -119,6 +120,12 @@ class Belief:
         """P(candidate | memory), (B, C)."""
         return torch.softmax(self.log_posterior, dim=1)
 
+    def log_likelihood(self, model: Dynamics, data: Batch) -> Tensor:
+        """Log p(s' | s, a, theta*, h*) of the encoded data of the B robots, a mean over the ensemble, (B, n)."""
+        rows = Batch(*(values.repeat_interleave(model.members, dim=0) for values in (data.x, data.y, data.weight)))
+        log_p = model.log_likelihood(self.theta, self.h, rows)
+        return log_p.view(len(self.log_posterior), model.members, -1).mean(dim=1).clamp(min=-1e30)
+
     def is_finite(self) -> Tensor:
         """For which robots all parameters are finite numbers, (B,)."""
         robots = len(self.log_posterior)
@@ -163,6 +170,14 @@ def filtered_posterior(candidates: Candidates, log_posterior: Tensor, log_p: Ten
     """
     stays = log_posterior.log_softmax(dim=1) + math.log1p(-hazard)
     return (torch.logaddexp(stays, candidates.log_prior + math.log(hazard)) + log_p).log_softmax(dim=1)
+
+
+def better_explained(memory: Memory, candidate: Tensor) -> Tensor:
+    """Whether theta_meta with a candidate (B,) explains transitions better than what each robot believed then, (B,).
+
+    Both are judged by transitions that no gradient step had seen when they were made.
+    """
+    return ((memory.explained_by(candidate) - memory.own_log_p) * memory.weight).sum(dim=1) > 0.0
 
 
 def systematic_sample(posterior: Tensor, n: int, offset: float) -> Tensor:

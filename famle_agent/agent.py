@@ -54,16 +54,16 @@ class ModelBasedAgent(SimulationLearner):
         """What B robots believe before they have seen anything."""
 
     @abstractmethod
-    def _log_likelihood(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
-        """How well each candidate explains a transition of each of B robots, (B, C); actions in [-1, 1]."""
+    def _log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
+        """How well each candidate explains a transition of each of B robots, (B, C), and how well its belief, (B,)."""
 
     @abstractmethod
     def _infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
         """The belief with a posterior that knows of the newest transition of the robots that ``moved`` (B,)."""
 
     @abstractmethod
-    def _adapt(self, memory: Memory, belief: Belief) -> Belief:
-        """What B robots believe after the transitions in their memory."""
+    def _adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
+        """What B robots believe after the transitions in their memory, and what of these still counts then."""
 
     def learn(
         self,

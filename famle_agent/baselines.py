@@ -48,19 +48,20 @@ class _OneModelAgent(ModelBasedAgent):
         theta, h = expand(model.parameters_by_name(), robots), model.embeddings_of(c)
         return Belief(theta, h, torch.zeros(robots, 1, device=self.device))
 
-    def _log_likelihood(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
-        return torch.zeros(len(obs), 1, device=self.device)
+    def _log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
+        nothing = torch.zeros(len(obs), device=self.device)
+        return nothing[:, None], nothing
 
     def _infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
         return belief
 
-    def _adapt(self, memory: Memory, belief: Belief) -> Belief:
+    def _adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
         """Theta* = k gradient steps on the last M transitions, from theta_meta (the paper's eq. 3) or going on."""
         settings = self.hyperparameters
         start = belief if settings.keep_adapting else self._prior(len(memory.weight))
         start = replace(start, adaptations=belief.adaptations + 1)
-        steps = settings.adaptation(memory.seen)
-        return descend(self._require_dynamics(), start, memory, steps, settings.validation_size, self._sample(belief))
+        model, steps = self._require_dynamics(), settings.adaptation(memory.seen)
+        return memory, descend(model, start, memory, steps, settings.validation_size, self._sample(belief))
 
 
 class AMPC(_OneModelAgent):

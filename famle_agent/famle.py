@@ -9,7 +9,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation import Belief, Candidates, adapt, filtered_posterior, prior, window_posterior
+from famle_agent.adaptation import (
+    Belief,
+    Candidates,
+    better_explained,
+    descend,
+    filtered_posterior,
+    prior,
+    select,
+    window_posterior,
+)
 from famle_agent.agent import ModelBasedAgent
 from famle_agent.dashboard import log_embeddings
 from famle_agent.memory import Memory
@@ -77,27 +86,32 @@ class FAMLE(ModelBasedAgent):
     def _prior(self, robots: int) -> Belief:
         return prior(self._require_dynamics(), self._candidates(), robots)
 
-    def _log_likelihood(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
-        model = self._require_dynamics()
+    def _log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
+        model, settings = self._require_dynamics(), self.hyperparameters
         transition = model.encode(obs[:, None], action[:, None], next_obs[:, None])
-        return self.hyperparameters.likelihood_power * self._candidates().log_likelihood(model, transition)[:, 0]
+        log_p = settings.likelihood_power * self._candidates().log_likelihood(model, transition)[:, 0]
+        if not settings.keep_adapting:
+            return log_p, torch.zeros_like(log_p[:, 0])  # nobody asks
+        return log_p, settings.likelihood_power * belief.log_likelihood(model, transition)[:, 0]
 
     def _infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
         if hazard := self.hyperparameters.hazard:
             new = filtered_posterior(self._candidates(), belief.log_posterior, memory.log_p[:, -1], hazard)
             return replace(belief, log_posterior=torch.where(moved[:, None], new, belief.log_posterior))
-        return replace(belief, log_posterior=window_posterior(self._candidates(), memory))
+        return replace(belief, log_posterior=window_posterior(self._candidates(), self._window(memory)))
 
-    def _adapt(self, memory: Memory, belief: Belief) -> Belief:
+    def _window(self, memory: Memory) -> Memory:
+        """The transitions by which an embedding is selected."""
+        return memory.split(self.hyperparameters.selection_window)[1]
+
+    def _adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
         """Algorithm 2, lines 6 and 7: the most likely embedding, then k gradient steps on theta and h."""
-        settings = self.hyperparameters
-        return adapt(
-            self._require_dynamics(),
-            self._candidates(),
-            memory,
-            settings.adaptation(memory.seen),
-            belief,
-            settings.validation_size,
-            settings.spread_members,
-            self._sample(belief),
-        )
+        settings, model = self.hyperparameters, self._require_dynamics()
+        start = select(model, self._candidates(), belief, settings.spread_members)
+        if settings.keep_adapting:
+            likely = belief.log_posterior.argmax(dim=1)
+            anew = better_explained(self._window(memory), likely)
+            memory = memory.begun_anew(anew, settings.selection_window, likely)
+            start = start.where(anew, replace(belief, adaptations=start.adaptations))
+        steps = settings.adaptation(memory.seen)
+        return memory, descend(model, start, memory, steps, settings.validation_size, self._sample(belief))

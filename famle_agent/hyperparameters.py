@@ -73,8 +73,10 @@ class Hyperparameters:
             seen most; 0 counts steps.
         adapt_batch_size: Transitions per step of online adaptation, drawn from the memory; 0 takes all, as the paper
             does.
-        keep_adapting: Whether an agent without embeddings takes its gradient steps from the network that it has,
-            instead of from the meta-learned one each time (the paper's).
+        keep_adapting: Whether gradient steps go on from where the last ones led, instead of beginning with what was
+            meta-learned each time (the paper's). FAMLE goes on as long as no embedding explains the robot better than
+            its adapted model does; then it begins anew, with the transitions that selected the embedding alone.
+        selection_size: The newest transitions, by which the embedding is selected; 0 takes all M, as the paper does.
         adapt_lr: alpha of online adaptation; None takes ``inner_lr``.
         adapt_embedding_lr: beta of online adaptation; None takes ``embedding_lr``.
         validation_size: The newest transitions of the memory, which gradient steps do not see and which decide whether
@@ -137,6 +139,7 @@ class Hyperparameters:
     adapt_epochs: int = 0
     adapt_batch_size: int = 0
     keep_adapting: bool = False
+    selection_size: int = 0
     adapt_lr: float | None = None
     adapt_embedding_lr: float | None = None
     validation_size: int = 0
@@ -233,6 +236,11 @@ class Hyperparameters:
             own(self.adapt_optimizer, self.inner_optimizer),
         )
 
+    @property
+    def selection_window(self) -> int:
+        """How many transitions select the embedding."""
+        return self.selection_size or self.memory_size
+
     def reptile(self) -> Reptile:
         """Algorithm 1."""
         return Reptile(
@@ -258,7 +266,7 @@ class Hyperparameters:
 _ONLINE = {
     *("compose", "likelihood_power", "hazard", "adapt_every", "adapt_at_reset", "memory_size", "forget_at_reset"),
     *("adapt_optimizer", "adapt_steps", "adapt_epochs", "adapt_batch_size", "adapt_lr", "adapt_embedding_lr"),
-    "keep_adapting",
+    *("keep_adapting", "selection_size"),
     *("validation_size", "spread_members", "clamp_predictions", "planning_reward"),
     *("planner", "horizon", "candidates", "planner_iterations", "elites", "init_std", "noise_beta", "temperature"),
 }

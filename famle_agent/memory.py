@@ -24,6 +24,7 @@ class Memory:
         next_obs: (B, M, obs_dim).
         log_p: Log-likelihood of each transition under each candidate, (B, M, C). It does not change as long as
             theta_meta does not, so that it is computed once for each transition.
+        own_log_p: Log-likelihood of each transition under what the robot believed when it happened, (B, M).
         weight: 1 for a transition, 0 for a place that is empty yet, (B, M).
     """
 
@@ -31,6 +32,7 @@ class Memory:
     action: Tensor
     next_obs: Tensor
     log_p: Tensor
+    own_log_p: Tensor
     weight: Tensor
 
     @classmethod
@@ -41,7 +43,14 @@ class Memory:
         obs, action, log_p = (
             torch.zeros(robots, size, dim, device=device) for dim in (obs_dim, action_dim, candidates)
         )
-        return cls(obs, action, obs, log_p, torch.zeros(robots, size, device=device))
+        nothing = torch.zeros(robots, size, device=device)
+        return cls(obs, action, obs, log_p, nothing, nothing)
+
+    @classmethod
+    def full(cls, obs: Tensor, action: Tensor, next_obs: Tensor, log_p: Tensor) -> Memory:
+        """A memory of M transitions of each robot, of which nobody knows what the robot believed then."""
+        weight = torch.ones(obs.shape[:2], device=obs.device)
+        return cls(obs, action, next_obs, log_p, torch.zeros_like(weight), weight)
 
     @property
     def seen(self) -> int:
@@ -68,9 +77,37 @@ class Memory:
             empty = values.new_zeros(len(values), size, *values.shape[2:])
             return torch.cat([empty, values], dim=1)[:, -size:]
 
-        return Memory(fit(self.obs), fit(self.action), fit(self.next_obs), fit(self.log_p), fit(self.weight))
+        return Memory(**{name: fit(values) for name, values in vars(self).items()})
 
-    def add(self, obs: Tensor, action: Tensor, next_obs: Tensor, log_p: Tensor, valid: Tensor) -> Memory:
+    def where(self, kept: Tensor, other: Memory) -> Memory:
+        """This memory for the robots in ``kept`` (B,), and the other one for the rest."""
+
+        def choose(mine: Tensor, theirs: Tensor) -> Tensor:
+            return torch.where(kept.view(-1, *[1] * (mine.ndim - 1)), mine, theirs)
+
+        return Memory(**{name: choose(values, getattr(other, name)) for name, values in vars(self).items()})
+
+    def begun_anew(self, rows: Tensor, newest: int, candidate: Tensor) -> Memory:
+        """The memory of robots that take their newest transitions for those of another situation.
+
+        Args:
+            rows: Which robots do, (B,).
+            newest: How many transitions they keep.
+            candidate: What they believe from now on, and as if they had believed it in these transitions, (B,).
+        """
+        _, kept = self.split(newest)
+        weight = torch.where(rows[:, None], kept.weight, self.weight)
+        own_log_p = torch.where(rows[:, None], self.explained_by(candidate), self.own_log_p)
+        return replace(self, own_log_p=own_log_p, weight=weight)
+
+    def explained_by(self, candidate: Tensor) -> Tensor:
+        """The log-likelihood of each transition under a candidate for each robot (B,), (B, M)."""
+        index = candidate[:, None, None].expand(-1, self.log_p.shape[1], 1)
+        return self.log_p.gather(2, index)[..., 0]
+
+    def add(
+        self, obs: Tensor, action: Tensor, next_obs: Tensor, log_p: Tensor, own_log_p: Tensor, valid: Tensor
+    ) -> Memory:
         """Inserts one transition per robot where ``valid`` (B,), and drops that robot's oldest."""
         everywhere = bool(valid.all())  # as nearly always; a second copy of a large memory is worth avoiding
 
@@ -83,6 +120,7 @@ class Memory:
             push(self.action, action),
             push(self.next_obs, next_obs),
             push(self.log_p, log_p),
+            push(self.own_log_p, own_log_p),
             push(self.weight, torch.ones_like(valid, dtype=obs.dtype)),
         )
 

@@ -69,9 +69,10 @@ class OnlineLoop:
 
     Attributes:
         prior: What B robots believe before they have seen anything.
-        log_likelihood: Log-likelihood of a transition of each robot under each candidate, (B, C).
+        log_likelihood: Log-likelihood of a transition of each robot under each candidate, (B, C), and under what it
+            believes, (B,).
         infer: The belief with its posterior brought up to date after each transition, for the robots that had one.
-        adapt: The belief with the model brought up to date (lines 6 and 7).
+        adapt: The belief with the model brought up to date (lines 6 and 7), and what of the memory still counts then.
         simulator: The model that a belief stands for, given what the robots have seen.
         reward_fn: r(s, a, s') with actions in [-1, 1].
         planner: MPC (line 8).
@@ -82,9 +83,9 @@ class OnlineLoop:
     """
 
     prior: Callable[[int], Belief]
-    log_likelihood: Callable[[Tensor, Tensor, Tensor], Tensor]
+    log_likelihood: Callable[[Belief, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
     infer: Callable[[Memory, Belief, Tensor], Belief]
-    adapt: Callable[[Memory, Belief], Belief]
+    adapt: Callable[[Memory, Belief], tuple[Memory, Belief]]
     simulator: Callable[[Belief, Memory], Model]
     reward_fn: RewardFn
     planner: Planner
@@ -109,14 +110,16 @@ class OnlineLoop:
         """
         if state.last is None:
             return state
-        memory = state.memory.add(*state.last, obs, self.log_likelihood(*state.last, obs), valid=~starts)
+        log_p = self.log_likelihood(state.belief, *state.last, obs)
+        memory = state.memory.add(*state.last, obs, *log_p, valid=~starts)
         if starts.all():
             return replace(state, last=None)
         adapts = self.adapt_every or self.adapt_at_reset
         belief = self.infer(memory, state.belief, ~starts) if adapts else state.belief
         state = replace(state, memory=memory, belief=belief, last=None, steps=state.steps + 1)
         if self.adapt_every and state.steps % self.adapt_every == 0:
-            state = replace(state, belief=self.adapt(state.memory, state.belief))
+            memory, belief = self.adapt(state.memory, state.belief)
+            state = replace(state, memory=memory, belief=belief)
         return state
 
     @torch.no_grad()
@@ -136,8 +139,9 @@ class OnlineLoop:
         kept = ~starts
         seen = starts & (state.memory.weight.sum(dim=1) > 0)
         if self.adapt_at_reset and seen.any() and state.steps > state.adapted_at:
-            belief = self.adapt(state.memory, state.belief).where(seen, state.belief)
-            state = replace(state, belief=belief, adapted_at=state.steps)
+            memory, belief = self.adapt(state.memory, state.belief)
+            memory, belief = memory.where(seen, state.memory), belief.where(seen, state.belief)
+            state = replace(state, memory=memory, belief=belief, adapted_at=state.steps)
         if self.forget_at_reset:
             memory = replace(state.memory, weight=state.memory.weight * kept[:, None])
             state = replace(state, memory=memory, belief=state.belief.where(kept, self.prior(state.robots)))

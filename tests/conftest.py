@@ -28,6 +28,7 @@ SMALL: dict[str, Any] = {
     "inner_steps": 20,
     "adapt_every": 2,
     "memory_size": 50,
+    "selection_size": 0,
     "horizon": 10,
     "candidates": 100,
     "planner_iterations": 3,

@@ -180,7 +180,7 @@ def rows_of(theta: Theta, rows: slice) -> Theta:
 def memory_of(model: Dynamics, candidates: Candidates, obs: Tensor, action: Tensor, next_obs: Tensor) -> Memory:
     """A memory full of the transitions of B robots, (B, M, ...)."""
     log_p = candidates.log_likelihood(model, model.encode(obs, action, next_obs))
-    return Memory(obs, action, next_obs, log_p, torch.ones(obs.shape[:2]))
+    return Memory.full(obs, action, next_obs, log_p)
 
 
 def adapted(model: Dynamics, candidates: Candidates, memory: Memory, inner_loop: InnerLoop) -> Belief:

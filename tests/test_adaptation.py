@@ -49,9 +49,9 @@ def tensors_of(transitions: Transitions, rows: slice = slice(None)) -> list[Tens
     return [torch.from_numpy(getattr(transitions, name)[rows]) for name in ("obs", "action", "next_obs")]
 
 
-def transition(value: float, robots: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def transition(value: float, robots: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     one = torch.full((robots, 1), value)
-    return one, one + 0.1, one + 0.2, torch.cat([one + 0.3, one + 0.4], dim=1)
+    return one, one + 0.1, one + 0.2, torch.cat([one + 0.3, one + 0.4], dim=1), one[:, 0] + 0.5
 
 
 # --- the memory -------------------------------------------------------------------------------------------
@@ -80,6 +80,7 @@ def test_memory_keeps_the_last_transitions_in_order(size: int, valid: list[list[
         torch.testing.assert_close(memory.action[robot, filled, 0], obs + 0.1)
         torch.testing.assert_close(memory.next_obs[robot, filled, 0], obs + 0.2)
         torch.testing.assert_close(memory.log_p[robot, filled], torch.stack([obs + 0.3, obs + 0.4], dim=1))
+        torch.testing.assert_close(memory.own_log_p[robot, filled], obs + 0.5)
 
 
 def test_adding_leaves_the_old_memory_as_it_is() -> None:
@@ -103,7 +104,7 @@ def remembered(valid: list[list[bool]]) -> tuple[Memory, list[list[Tensor]]]:
     memory, seen = Memory.empty(robots, 5, 3, 1, 2, CPU), [list[Tensor]() for _ in range(robots)]
     for flags in valid:
         obs, next_obs, action, log_p = (torch.randn(robots, size) for size in (3, 3, 1, 2))
-        memory = memory.add(obs, action, next_obs, log_p, torch.tensor(flags))
+        memory = memory.add(obs, action, next_obs, log_p, torch.randn(robots), torch.tensor(flags))
         for robot in range(robots):
             seen[robot] += [torch.stack([obs[robot], next_obs[robot]])] * flags[robot]
     return memory, [rows[-5:] for rows in seen]
@@ -129,7 +130,7 @@ def test_memory_knows_how_much_it_has_seen_and_how_far_it_went(valid: list[list[
 def numbered(weight: Tensor) -> Memory:
     """Transitions whose observations say which they are."""
     obs = torch.arange(weight.numel(), dtype=torch.float32).view(*weight.shape, 1)
-    return Memory(obs, torch.zeros_like(obs), obs + 1.0, torch.zeros_like(obs), weight)
+    return replace(Memory.full(obs, torch.zeros_like(obs), obs + 1.0, torch.zeros_like(obs)), weight=weight)
 
 
 def model_of(members: int = 1) -> Dynamics:

@@ -31,6 +31,7 @@ TINY: dict[str, Any] = {
     "compose": True,
     "adapt_every": 2,
     "adapt_steps": 2,
+    "adapt_batch_size": 0,
     "memory_size": 20,
     "horizon": 4,
     "candidates": 12,

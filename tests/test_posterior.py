@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -24,7 +25,7 @@ def candidates_of(n: int, compose: bool = False) -> Candidates:
 
 def memory_with(log_p: Tensor, weight: Tensor) -> Memory:
     empty = torch.zeros(*log_p.shape[:2], 1)
-    return Memory(empty, empty, empty, log_p, weight)
+    return replace(Memory.full(empty, empty, empty, log_p), weight=weight)
 
 
 def filtered(candidates: Candidates, log_p: Tensor, hazard: float) -> list[Tensor]:
@@ -118,7 +119,7 @@ def tell(agent: FAMLE, transitions: Transitions, situations: Any, steps: range) 
 @pytest.mark.parametrize("hazard", [0.0, 1e-3])
 def test_posterior_knows_of_each_transition_at_once(load_agent: Load, transitions: Transitions, hazard: float) -> None:
     """And not only every K steps, when the model is adapted to it."""
-    agent = load_agent(hazard=hazard, adapt_every=5, adapt_steps=1, memory_size=20)
+    agent = load_agent(hazard=hazard, adapt_every=5, adapt_steps=1, memory_size=20, selection_size=0)
     beliefs = tell(agent, transitions, [3, 8], range(12))
     assert agent.belief.adaptations == 2
     for earlier, later in zip([agent._prior(2).posterior, *beliefs], beliefs, strict=False):
@@ -143,7 +144,7 @@ def test_robot_without_a_transition_keeps_its_posterior(
 def test_filter_sees_the_break_before_the_window_does(load_agent: Load, transitions: Transitions) -> None:
     steps = []
     for hazard in (0.0, 1e-3):
-        agent = load_agent(hazard=hazard, adapt_every=1000, memory_size=50)
+        agent = load_agent(hazard=hazard, adapt_every=1000, memory_size=50, selection_size=0)
         tell(agent, transitions, [3], range(50))
         likely = [int(belief.argmax()) for belief in tell(agent, transitions, [8], range(50, 100))]
         steps.append(likely.index(8))
