@@ -16,31 +16,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 import tyro
-from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 
 from benchmarks import curves
 from benchmarks.compare import compare
-from benchmarks.harness import Options, Result, load_results
+from benchmarks.harness import Options, Result
 from benchmarks.methods import METHODS, PPO_METHODS, Method, Task, famle
-from benchmarks.summaries import by_method, interquartile_mean, plot_curves, quartiles
-from benchmarks.summaries import summary as summary_of_curves
+from benchmarks.reporting.report import show
 from famle_agent import FAMLE, FAMLEWrapper, ModelBasedAgent
-from famle_agent.plots import style
 from famle_agent.walking import BrokenRun, run_and_break
 from famle_envs import Situation
 from famle_envs.ant import AntEnv
 from famle_envs.wrappers import RandomSituation
 
 ENV_ID = "FamleAnt-v0"
-SOLVED = 800.0
 WALKS = 0.8  # m/s
 BIN = 50  # steps of a stored mean speed
 ADAPTS: dict[str, Any] = {"adapt_every": 10, "adapt_steps": 10, "adapt_lr": 3e-4, "adapt_embedding_lr": 1e-2}
@@ -222,45 +215,6 @@ def _result(result: BrokenRun, situation: Situation) -> Result:
     }
 
 
-def summary(results: list[Result], title: str) -> Table:
-    """One row a method."""
-    table = Table(
-        "method", "n", "return, median (quartiles)", "IQM [95 %]", "> 800", "> 1,200", "recovery", "ms", title=title
-    )
-    for method, runs in by_method(results).items():
-        returns = np.array([run["return"] for run in runs])
-        low, median, high = quartiles(returns)
-        recovery = [np.inf if run["recovery"] is None else run["recovery"] for run in runs]
-        table.add_row(
-            method,
-            str(len(runs)),
-            f"{median:.0f} ({low:.0f}-{high:.0f})",
-            "{:.0f} [{:.0f}, {:.0f}]".format(*interquartile_mean(returns)),
-            f"{(returns > SOLVED).mean():.0%}",
-            f"{(returns > 1200).mean():.0%}",
-            f"{np.median(recovery):.0f}, {np.isfinite(recovery).sum()}/{len(runs)}",
-            f"{np.median([run['ms_per_step']['median'] for run in runs]):.0f}",
-        )
-    return table
-
-
-def plot_speeds(results: list[Result], title: str, path: Path) -> None:
-    """Median speed and quartiles over the robot's steps, a colour a method."""
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
-    axes = figure.add_subplot()
-    for method, runs in by_method(results).items():
-        low, median, high = quartiles([run["speed"] for run in runs])
-        x = BIN * (0.5 + np.arange(len(median)))
-        (line,) = axes.plot(x, median, label=f"{method} (n = {len(runs)})")
-        axes.fill_between(x, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
-    axes.axhline(WALKS, color="0.4", linestyle="--", linewidth=1, label="the paper's solved mark")
-    if break_at := results[0]["break_at"]:
-        axes.axvline(break_at, color="0.4", linestyle=":", linewidth=1, label="breaks")
-    style(axes, "robot steps", "forward speed (m/s)", title)
-    axes.legend(fontsize="small")
-    figure.savefig(path, dpi=150)
-
-
 def main(args: Args) -> None:
     """Runs and reports."""
     methods = args.methods or DEFAULT_METHODS[args.experiment]
@@ -268,13 +222,7 @@ def main(args: Args) -> None:
     tasks = [Task("ant", seed, damage_of(args.experiment, seed), args.cache) for seed in range(args.replicates)]
     fleets = partial(run_fleet, args=args) if args.experiment == "curves" else None
     compare(methods, tasks, partial(run, args=args), folder, args, ANT_METHODS, fleets)
-    results, title = load_results(folder), f"Ant, {args.experiment}"
-    if args.experiment == "curves":
-        Console(width=160).print(summary_of_curves(results, SOLVED, title, within=args.steps))
-        plot_curves(results, SOLVED, title, args.out / "ant-curves.png", args.curve_steps)
-    else:
-        Console(width=160).print(summary(results, title))
-        plot_speeds(results, title, args.out / f"ant-{args.experiment}.png")
+    show(args.out, folder.name)
 
 
 if __name__ == "__main__":

@@ -13,14 +13,12 @@ from typing import Literal
 
 import numpy as np
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from benchmarks.compare import compare
 from benchmarks.gait_robots import run
-from benchmarks.harness import Options, Result, load_results
+from benchmarks.harness import Options, load_results
 from benchmarks.methods import Task
-from benchmarks.summaries import by_method, quartiles
+from benchmarks.reporting.report import show
 from famle_agent.plots import plot_paths
 from famle_envs import Situation
 from famle_envs.minitaur import REALITY
@@ -46,30 +44,13 @@ def task_of(experiment: str, seed: int, args: Args) -> Task:
     return Task("minitaur", seed, Situation(), args.cache, profile)
 
 
-def summary(results: list[Result], experiment: str) -> Table:
-    """One row a method, as the paper's table II."""
-    title = f"Minitaur, {experiment} (paper, real robot: 4.8 m in 60 s)"
-    table = Table("method", "n", "distance (m), median (quartiles)", "fell", "gaits", "ms a plan", title=title)
-    for method, runs in by_method(results).items():
-        low, median, high = quartiles([run["distance"] for run in runs])
-        table.add_row(
-            method,
-            str(len(runs)),
-            f"{median:.2f} ({low:.2f}-{high:.2f})",
-            f"{sum(run['fell'] for run in runs)}/{len(runs)}",
-            f"{np.median([run['gaits'] for run in runs]):.0f}",
-            f"{np.median([run['ms_per_plan'] for run in runs]):.0f}",
-        )
-    return table
-
-
 def main(args: Args) -> None:
     """Runs and reports."""
     folder = args.out / f"minitaur-{args.experiment}"
     methods = args.methods or DEFAULT_METHODS[args.experiment]
     compare(methods, [task_of(args.experiment, seed, args) for seed in range(args.replicates)], run, folder, args)
     results = load_results(folder)
-    Console(width=120).print(summary(results, args.experiment))
+    show(args.out, folder.name)
     first = {result["method"]: np.array(result["path"]) for result in results if result["seed"] == 0}
     title = f"Minitaur, {args.experiment}, replicate 0"
     plot_paths(first, title, args.out / f"minitaur-{args.experiment}.png")

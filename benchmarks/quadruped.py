@@ -14,20 +14,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from benchmarks.compare import compare
 from benchmarks.gait_robots import run
-from benchmarks.harness import Options, Result, load_results
+from benchmarks.harness import Options, load_results
 from benchmarks.methods import Task
-from benchmarks.summaries import by_method
+from benchmarks.reporting.report import show
 from famle_agent.plots import plot_paths
 from famle_envs import Situation
 from famle_envs.quadruped import LEGS, REALITY, blocked_leg
 
 YAW = math.radians(30)
-PAPER = {"yaw": "32.6 +- 2.3", "leg": "43.1 +- 6.4", "both": "41.6 +- 7.7"}
 RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
 PARTS = ("famle", "famle-frozen", "famle-nearest", "famle-likeliest")
 DEFAULT_METHODS = {
@@ -60,23 +57,6 @@ def task_of(experiment: str, seed: int, args: Args) -> Task:
     return replace(task, later=wrong["yaw"], strikes_at=5) if experiment == "later" else task
 
 
-def summary(results: list[Result], experiment: str) -> Table:
-    """One row a method, as the paper's table I; a run without success counts as 80 gaits in the median."""
-    title = f"Quadruped, {experiment}" + (f" (paper: {PAPER[experiment]}, 100 %)" if experiment in PAPER else "")
-    table = Table("method", "n", "success", "gaits, mean +- deviation", "median", "ms a plan", title=title)
-    for method, runs in by_method(results).items():
-        gaits = np.array([run["gaits"] for run in runs if run["reached"]])
-        table.add_row(
-            method,
-            str(len(runs)),
-            f"{len(gaits) / len(runs):.0%}",
-            f"{gaits.mean():.1f} +- {gaits.std():.1f}" if len(gaits) else "-",
-            f"{np.median([run['gaits'] for run in runs]):.0f}",
-            f"{np.median([run['ms_per_plan'] for run in runs]):.0f}",
-        )
-    return table
-
-
 def main(args: Args) -> None:
     """Runs and reports."""
     for experiment in args.experiments:
@@ -84,7 +64,7 @@ def main(args: Args) -> None:
         folder = args.out / f"quadruped-{experiment}"
         compare(methods, [task_of(experiment, seed, args) for seed in range(args.replicates)], run, folder, args)
         results = load_results(folder)
-        Console(width=120).print(summary(results, experiment))
+        show(args.out, folder.name)
         first = {result["method"]: np.array(result["path"]) for result in results if result["seed"] == 0}
         plot_paths(first, f"Quadruped, {experiment}, replicate 0", args.out / f"quadruped-{experiment}.png", (2.5, 0.0))
 

@@ -13,18 +13,14 @@ from typing import Literal
 
 import numpy as np
 import tyro
-from rich.console import Console
 
 from benchmarks import curves
 from benchmarks.compare import compare
-from benchmarks.harness import Options, Result, load_results
+from benchmarks.harness import Options, Result
 from benchmarks.methods import METHODS, PPO_METHODS, Task
-from benchmarks.summaries import plot_curves, summary
+from benchmarks.reporting.report import show
 from famle_envs import Situation
 from famle_envs.reacher import ReacherEnv
-
-SOLVED = 30.0
-
 
 MODEL_BASED = ("famle", "famle-paper", "famle-original", "ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
 
@@ -68,10 +64,7 @@ def main(args: Args) -> None:
     tasks = [Task("reacher", seed, situation_of(args.damage, seed), args.cache) for seed in range(args.replicates)]
     folder = args.out / f"reacher-{args.damage}"
     compare(methods, tasks, partial(run, args=args), folder, args, run_fleet=partial(run_fleet, args=args))
-    results = load_results(folder)
-    title = f"Reacher, {args.damage} damage"
-    Console(width=160).print(summary(results, SOLVED, title, within=200))
-    plot_curves(results, SOLVED, title, args.out / f"reacher-{args.damage}.png", args.steps)
+    show(args.out, folder.name)
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ from scipy.stats import trim_mean
 from torch import Tensor
 
 from benchmarks.harness import Result, provenance, write_json
-from benchmarks.summaries import interquartile_mean, quartiles
+from benchmarks.reporting.statistics import interquartile_mean, quartiles
 from famle_agent.adaptation import Candidates, adapt, prior, window_posterior
 from famle_agent.dynamics import Dynamics
 from famle_agent.inner_loop import InnerLoop

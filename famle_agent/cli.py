@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from benchmarks.harness import ReplicateError
-from benchmarks.reporting import Report
+from benchmarks.reporting.report import Report
 from benchmarks.suite import Benchmark
 from famle_agent.cluster import Backend, parallel
 from famle_agent.demo import run_demo, run_episode

@@ -11,6 +11,8 @@ from benchmarks import minitaur, quadruped
 from benchmarks.gait_robots import run
 from benchmarks.harness import Replicate, load_results, run_replicates
 from benchmarks.methods import METHODS, Task
+from benchmarks.reporting.looks import look
+from benchmarks.reporting.report import show
 from famle_envs import Situation
 from famle_envs.quadruped import QuadrupedEnv
 
@@ -30,19 +32,20 @@ def test_tests_are_run_in_reality_and_on_damage_that_no_training_situation_has()
 
 
 @pytest.mark.slow
-def test_replicate_is_stored_with_its_profile_and_summed_up(tmp_path: Path) -> None:
+def test_replicate_is_stored_with_its_profile_and_summed_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for method in ("famle", "famle-frozen"):
         task = quadruped.task_of("yaw", 0, quadruped.Args(cache=tmp_path))
-        run_replicates([Replicate(method, 0, partial(run, method, task))], tmp_path, jobs=1)
-    results = load_results(tmp_path)
+        run_replicates([Replicate(method, 0, partial(run, method, task))], tmp_path / "quadruped-yaw", jobs=1)
+    results = load_results(tmp_path / "quadruped-yaw")
     for result in results:
         assert result["profile"].startswith("reality: motor_strength 0.03")
         assert len(result["path"]) == result["gaits"] + 1
         assert result["distance"] == pytest.approx(result["path"][-1][0], abs=1e-3)
         assert result["reached"] == (np.hypot(2.5 - result["path"][-1][0], result["path"][-1][1]) < 0.25)
     assert results[1]["believed"] == "intact"
-    assert quadruped.summary(results, "yaw").row_count == 2
-    assert minitaur.summary(results, "reality").row_count == 2
+    show(tmp_path, "quadruped-yaw")
+    shown = capsys.readouterr().out
+    assert all(look(method).label in shown for method in ("famle", "famle-frozen"))
 
 
 @pytest.mark.parametrize("robot", ["quadruped", "minitaur"])
@@ -55,12 +58,3 @@ def test_methods_are_the_shipped_agent_with_something_changed(robot: str, method
     assert (settings.adaptation(seen=1).steps == 0) == (method == "famle-nearest")
     assert settings.spread_members == (method in ("famle", "famle-frozen"))
     agent.get_env().close()
-
-
-def test_success_rate_and_gaits_are_those_of_the_runs() -> None:
-    runs = [
-        {"method": "a", "reached": r, "gaits": g, "ms_per_plan": 1.0} for r, g in ((True, 10), (True, 20), (False, 80))
-    ]
-    table = quadruped.summary(runs, "yaw")
-    cells = [next(iter(column.cells)) for column in table.columns]
-    assert cells[:5] == ["a", "3", "67%", "15.0 +- 5.0", "20"]

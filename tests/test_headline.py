@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.headline import headline, insert
-from benchmarks.registry import EXPERIMENTS
-from benchmarks.reporting import Report
-from benchmarks.study import Study, read_study
+from benchmarks.reporting.headline import headline, insert
+from benchmarks.reporting.registry import EXPERIMENTS
+from benchmarks.reporting.report import Report
+from benchmarks.reporting.study import Study, read_study
 from tests.test_report import store_curves, store_gaits
 
 ROOT = Path(__file__).parent.parent

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from benchmarks.looks import LOOKS, in_order, look
-from benchmarks.registry import EXPERIMENTS, Experiment, Published
-from benchmarks.reporting import Report
+from benchmarks.reporting.looks import LOOKS, in_order, look
+from benchmarks.reporting.registry import EXPERIMENTS, Experiment, Published
+from benchmarks.reporting.report import Report, show
 
 PNG = b"\x89PNG"
 
@@ -182,6 +182,28 @@ def test_method_with_fewer_steps_is_compared_by_what_it_has(arm: Path) -> None:
     assert [row[name] for name in compared] == [""] * 4
     assert "100 robot steps of FAMLE, the paper's settings" in text
     assert "mean return over 200 robot steps" in text
+
+
+def test_episode_says_which_robots_walk_again(ant: Path) -> None:
+    for seed, steps in enumerate((100, 300, None)):
+        path = ant / "ant-unseen" / f"famle-{seed}.json"
+        stored = json.loads((ant / "ant-unseen" / "famle-0.json").read_text())
+        path.write_text(json.dumps(stored | {"seed": seed, "recovery": steps, "break_at": 300}))
+    text, out = report(ant)
+    row = by_name(out / "ant-unseen.csv")["famle"]
+    assert (row["recovered"], row["recovery"]) == ("2", "300.0")
+    assert rows_of(text, "FAMLE")[0][3:5] == ["2 of 3", "300"]
+
+
+def test_benchmark_shows_the_section_of_its_experiment(ant: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    show(ant, "ant-unseen")
+    shown = capsys.readouterr().out
+    assert "Ant, unseen damage" in shown
+    assert "2200" in shown  # the median of FAMLE
+    with pytest.raises(FileNotFoundError, match="run the benchmark first"):
+        show(ant, "reacher-paper")
+    with pytest.raises(ValueError, match=r"ant-moon.*registry\.py"):
+        show(ant, "ant-moon")
 
 
 def test_success_rate_and_gaits_stand_beside_the_paper_s(quadruped: Path) -> None:

@@ -8,8 +8,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import plugin_data_pb2
 
-from benchmarks.comparison_board import METRICS
-from benchmarks.reporting import Report
+from benchmarks.reporting.board import METRICS
+from benchmarks.reporting.report import Report
 from tests.test_report import store_curves, store_gaits, store_runs
 
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.registry import EXPERIMENTS
-from benchmarks.statistics import interquartile_mean, median_steps, probability_of_improvement
-from benchmarks.study import Study, quartiles_over_steps
+from benchmarks.reporting.registry import EXPERIMENTS
+from benchmarks.reporting.statistics import interquartile_mean, median_steps, probability_of_improvement
+from benchmarks.reporting.study import Study, quartiles_over_steps
 
 # Few different values, so that ties are common.
 samples = st.lists(st.integers(-20, 20).map(float), min_size=2, max_size=12)

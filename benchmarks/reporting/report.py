@@ -9,17 +9,21 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 from rich.console import Console
+from rich.markdown import Markdown
 
-from benchmarks.comparison_board import write_board
 from benchmarks.harness import write_whole
-from benchmarks.headline import headline, insert
-from benchmarks.markdown import document, section
-from benchmarks.pictures import draw, draw_times
-from benchmarks.registry import EXPERIMENTS, Experiment
-from benchmarks.study import Study, read_study
-from benchmarks.tables import figures, replicates, to_csv
+from benchmarks.reporting.board import write_board
+from benchmarks.reporting.headline import headline, insert
+from benchmarks.reporting.markdown import document, section
+from benchmarks.reporting.pictures import draw, draw_times
+from benchmarks.reporting.registry import EXPERIMENTS, Experiment, experiment_in
+from benchmarks.reporting.study import Study, read_study
+from benchmarks.reporting.tables import figures, replicates, to_csv
 
-__all__ = ["Report"]
+__all__ = ["Report", "show"]
+
+
+_WIDTH = 180
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,19 @@ class Report:
         """Folders of results that are no entry of the registry."""
         known = {experiment.folder for experiment in EXPERIMENTS}
         return sorted({path.parent.name for path in self.results.glob("*/*-*.json")} - known)
+
+
+def show(results: Path, folder: str) -> None:
+    """Prints the section of one experiment, as a benchmark does at its end.
+
+    Raises:
+        FileNotFoundError: There are no results of it.
+        ValueError: There is no such experiment, or a stored result is damaged.
+    """
+    study = read_study(experiment_in(folder), results)
+    if study is None:
+        raise FileNotFoundError(f"{results / folder} holds no results; run the benchmark first.")
+    Console(width=_WIDTH).print(Markdown(section(study, figures(study), pictures=[])))
 
 
 def _texts(studies: Sequence[Study], missing: Sequence[Experiment], unknown: Sequence[str]) -> dict[str, bytes]:

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import write_whole
-from benchmarks.looks import in_order, look
-from benchmarks.study import Study
-from benchmarks.tables import Row, figures
+from benchmarks.reporting.looks import in_order, look
+from benchmarks.reporting.study import Study
+from benchmarks.reporting.tables import Row, figures
 
 __all__ = ["headline", "insert"]
 

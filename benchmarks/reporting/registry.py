@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-__all__ = ["EXPERIMENTS", "Experiment", "Kind", "Published"]
+__all__ = ["EXPERIMENTS", "Experiment", "Kind", "Published", "experiment_in"]
 
 Kind = Literal["curves", "episode", "gaits", "distance"]
 """Learning curves, one episode's return, gaits to a goal, or the distance walked."""
@@ -191,6 +191,10 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     ),
     _ant("unseen", "unseen damage, the first episode"),
     _ant("untrained", "kinds of damage that were not trained, the first episode"),
+    _ant("break", "unseen damage in the middle of an episode"),
+    _ant("intact", "intact"),
+    _ant("members", "size of the ensemble, on the damage that was tuned on"),
+    _ant("validation", "kinds of adaptation, on the damage that was tuned on"),
     _quadruped(
         "yaw",
         "yaw sensor off by 30 degrees (table I)",
@@ -239,3 +243,15 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     _minitaur("home", "in its simulator"),
 )
 """What the report has a section for, in this order."""
+
+
+def experiment_in(folder: str) -> Experiment:
+    """The experiment whose results are in a folder.
+
+    Raises:
+        ValueError: There is none.
+    """
+    for experiment in EXPERIMENTS:
+        if experiment.folder == folder:
+            return experiment
+    raise ValueError(f"No experiment has its results in {folder!r}; add one to benchmarks/reporting/registry.py.")

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.harness import Result
-from benchmarks.looks import look
-from benchmarks.registry import Kind
-from benchmarks.statistics import (
+from benchmarks.reporting.looks import look
+from benchmarks.reporting.registry import Kind
+from benchmarks.reporting.statistics import (
     first_crossing,
     interquartile_mean,
     median_steps,
@@ -21,7 +21,7 @@ from benchmarks.statistics import (
     quartiles,
     solved_at,
 )
-from benchmarks.study import ROBOT_ALONE, SUBJECT, Measure, Study
+from benchmarks.reporting.study import ROBOT_ALONE, SUBJECT, Measure, Study
 
 __all__ = ["Row", "figures", "replicates", "to_csv"]
 
@@ -129,7 +129,13 @@ def _curves(study: Study, method: str) -> Row:
 
 
 def _episode(study: Study, method: str) -> Row:
-    return {"solved": sum(run["return"] > study.experiment.threshold for run in study.runs[method])}
+    runs = study.runs[method]
+    recovery = [run.get("recovery") for run in runs]
+    return {
+        "solved": sum(run["return"] > study.experiment.threshold for run in runs),
+        "recovered": sum(steps is not None for steps in recovery),
+        "recovery": median_steps(recovery),
+    }
 
 
 def _gaits(study: Study, method: str) -> Row:

@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import Result
-from benchmarks.looks import in_order, look
-from benchmarks.registry import Experiment, Kind
-from benchmarks.statistics import Array, quartiles
-from benchmarks.summaries import by_method
+from benchmarks.reporting.looks import in_order, look
+from benchmarks.reporting.registry import Experiment, Kind
+from benchmarks.reporting.statistics import Array, quartiles
 
 __all__ = ["ROBOT_ALONE", "SUBJECT", "Measure", "Study", "quartiles_over_steps", "read_study"]
 
@@ -213,7 +212,9 @@ def read_study(experiment: Experiment, results: Path) -> Study | None:
     """
     files = sorted((results / experiment.folder).glob("*-*.json"))
     stored = [_read(path, ("method", "seed", *_NEEDED[experiment.kind])) for path in files]
-    methods = by_method(sorted(stored, key=lambda run: int(run["seed"])))
+    methods: dict[str, list[Result]] = {}
+    for run in sorted(stored, key=lambda run: int(run["seed"])):
+        methods.setdefault(run["method"], []).append(run)
     runs = {method: methods[method] for method in in_order(methods)}
     return Study(experiment, runs, _step_times(experiment, results)) if runs else None
 

@@ -16,10 +16,10 @@ from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 from benchmarks.harness import Result
-from benchmarks.looks import in_order
-from benchmarks.registry import Kind
-from benchmarks.statistics import solved_at
-from benchmarks.study import Study, quartiles_over_steps
+from benchmarks.reporting.looks import in_order
+from benchmarks.reporting.registry import Kind
+from benchmarks.reporting.statistics import solved_at
+from benchmarks.reporting.study import Study, quartiles_over_steps
 
 __all__ = ["METRICS", "TRACES", "write_board"]
 

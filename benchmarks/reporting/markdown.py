@@ -7,10 +7,10 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.looks import look
-from benchmarks.registry import Experiment, Kind
-from benchmarks.study import Study
-from benchmarks.tables import Row
+from benchmarks.reporting.looks import look
+from benchmarks.reporting.registry import Experiment, Kind
+from benchmarks.reporting.study import Study
+from benchmarks.reporting.tables import Row
 
 __all__ = ["document", "section"]
 
@@ -41,7 +41,10 @@ def document(
         parts += ["## Not measured", f"| experiment | folder | command |\n| --- | --- | --- |\n{rows}"]
     if unknown:
         names = ", ".join(f"`{name}`" for name in unknown)
-        parts += ["## Stored and not shown", f"These folders have no entry in `benchmarks/registry.py`: {names}."]
+        parts += [
+            "## Stored and not shown",
+            f"These folders have no entry in `benchmarks/reporting/registry.py`: {names}.",
+        ]
     return "\n\n".join(parts) + "\n"
 
 
@@ -82,7 +85,9 @@ _NOTES: Mapping[Kind, str] = {
 them; a replicate that never gets there is infinite in the median. Methods are compared over the first {study.steps:,}
 robot steps, but for those of which the title says that they have fewer; *solved at* and *first crossing* are over all
 steps of a method. The time of a step contains the simulated robot and all learning on the way.""",
-    "episode": "The time is the median of a control step, with adaptation.",
+    "episode": """A robot walks again as soon as its mean speed over 100 steps is above 0.8 m/s, the paper's solved
+mark; the steps since the damage are a median, in which one that never does is infinite. The time is the median of a
+control step, with adaptation.""",
     "gaits": """Steps are the gaits of the runs that reach the goal, within {study.experiment.budget}. A gait takes a
 second; the paper's took about two. The time of a plan is without adaptation.""",
     "distance": """The largest distance and the seconds until then, medians over replicates of {study.experiment.budget}
@@ -120,6 +125,8 @@ def _times(study: Study) -> list[Column]:
 def _episode(study: Study) -> list[Column]:
     return [
         (f"above {study.experiment.threshold:g}", lambda row: _count(row, "solved")),
+        ("walks again", lambda row: _count(row, "recovered")),
+        ("after steps", lambda row: _steps(row.get("recovery"))),
         *_times(study),
     ]
 

@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from benchmarks.looks import in_order, look
-from benchmarks.statistics import Array, interquartile_mean
-from benchmarks.study import Study, quartiles_over_steps
+from benchmarks.reporting.looks import in_order, look
+from benchmarks.reporting.statistics import Array, interquartile_mean
+from benchmarks.reporting.study import Study, quartiles_over_steps
 from famle_agent.plots import style
 
 __all__ = ["draw", "draw_times"]
@@ -138,13 +138,24 @@ def _boxes(axes: Axes, study: Study, rows: Mapping[str, int]) -> None:
 
 
 def _draw_points(study: Study) -> Figure:
+    """What each replicate gets, and of episodes the speed on the way too."""
+    rows = len(study.runs) + sum(row.distance is not None for row in study.experiment.paper)
+    speeds = study.experiment.kind == "episode"
+    figure = Figure(figsize=(14.0 if speeds else 7.6, max(1.6 + 0.36 * rows, 4.6 * speeds)), layout="constrained")
+    panels = figure.subplots(1, 1 + speeds, squeeze=False).flatten()
+    _points(panels[0], study)
+    if speeds:
+        _speeds(panels[1], study)
+    figure.suptitle(_wrapped(study.title, 150 if speeds else 80), fontsize="medium")
+    return figure
+
+
+def _points(axes: Axes, study: Study) -> None:
     """Interquartile means with 95 % intervals, every replicate behind them, and the paper's figures as diamonds."""
     measure = study.measures[0]
     published = [(row.method, row.distance) for row in study.experiment.paper if row.distance is not None]
     names = [f"{look(method).label} (n = {len(runs)})" for method, runs in study.runs.items()]
     names += [f"the paper's {name}, its robot" for name, _ in published]
-    figure = Figure(figsize=(7.6, 1.6 + 0.36 * len(names)), layout="constrained")
-    axes = figure.add_subplot()
     for i, method in enumerate(study.runs):
         scores, colour = study.scores(method, measure), look(method).colour
         mean, error = _mean_and_error(scores)
@@ -157,8 +168,18 @@ def _draw_points(study: Study) -> Figure:
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.4, -0.6)
     style(axes, f"{measure.label}\nof each replicate; interquartile mean, 95 % interval", "")
-    figure.suptitle(_wrapped(study.title, 80), fontsize="medium")
-    return figure
+
+
+def _speeds(axes: Axes, study: Study) -> None:
+    """Median speed and quartiles over an episode, with the moment of the damage if it strikes on the way."""
+    for method, runs in study.runs.items():
+        x, (low, median, high) = quartiles_over_steps([study.trace(run) for run in runs])
+        drawn = look(method)
+        axes.plot(x, median, color=drawn.colour, linestyle=drawn.line)
+        axes.fill_between(x, low, high, color=drawn.colour, alpha=0.15, linewidth=0)
+        for breaks in {run["break_at"] for run in runs if run.get("break_at")}:
+            axes.axvline(breaks, color="0.4", linestyle=":", linewidth=1)
+    style(axes, "robot steps", "forward speed (m/s), median and quartiles")
 
 
 def _mean_and_error(scores: Array) -> tuple[float, Array]:
