@@ -150,6 +150,10 @@ def one_simulator(task: Task) -> FAMLE:
     return FAMLE.load(path, device="cpu", adapt_every=0)
 
 
+ANEW: Mapping[str, Any] = {"keep_adapting": False, "memory_size": 10, "selection_size": 0, "adapt_batch_size": 0}
+"""FAMLE that begins with what was meta-learned at each adaptation, as the paper does, on the last ten transitions."""
+
+
 # --- agents that are meta-trained for the benchmark -------------------------------------------------------------------
 
 
@@ -291,6 +295,7 @@ def _meta_trained(
 METHODS: dict[str, Method] = {
     "famle": Method(famle),
     "famle-frozen": Method(partial(famle, adapt_every=0)),
+    "famle-anew": Method(partial(famle, **ANEW)),
     "famle-select": Method(partial(famle, adapt_steps=0)),
     "famle-likeliest": Method(partial(famle, spread_members=False)),
     "famle-nearest": Method(partial(famle, adapt_steps=0, compose=False, spread_members=False)),

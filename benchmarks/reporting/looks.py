@@ -30,6 +30,7 @@ LOOKS: Mapping[str, Look] = {
     "famle": Look("FAMLE", "#0072b2", paper="FAMLE"),
     "famle-paper": Look("FAMLE, the paper's settings", "#56b4e9", paper="FAMLE"),
     "famle-original": Look("FAMLE, the authors' code's settings", "#6f4fa2", paper="FAMLE"),
+    "famle-anew": Look("FAMLE, anew at each adaptation", "#3f7fbf"),
     "famle-48": Look("FAMLE, 48 candidates", "#88aadd"),
     "famle-likeliest": Look("FAMLE, one start for all networks", "#117733"),
     "famle-select": Look("FAMLE, embeddings only", "#44aa99"),
