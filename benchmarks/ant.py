@@ -25,9 +25,10 @@ import tyro
 from benchmarks import curves
 from benchmarks.compare import compare
 from benchmarks.harness import Options, Result
-from benchmarks.methods import METHODS, PPO_METHODS, Method, Task, famle
+from benchmarks.methods import METHODS, PPO_METHODS, Method, Task, famle, from_cache
 from benchmarks.reporting.report import show
 from famle_agent import FAMLE, FAMLEWrapper, ModelBasedAgent
+from famle_agent.hyperparameters import known_robots
 from famle_agent.walking import BrokenRun, run_and_break
 from famle_envs import Situation
 from famle_envs.ant import AntEnv
@@ -119,40 +120,27 @@ def with_members(task: Task, members: int) -> FAMLE:
 
 def oracle(task: Task) -> FAMLE:
     """The upper line: from scratch on the very test situation, 28,000 simulated steps of it."""
+    budget: dict[str, Any] = {
+        **{"transitions_per_situation": 20_000, "joint_iterations": 3000},
+        **{"rounds": 4, "round_transitions": 2000, "round_iterations": 2000},
+    }
+    agent = FAMLE("ant", seed=task.seed, device="cpu", pretrained=False, compose=False, **budget)
     path = task.cache / f"ant-oracle-{str(task.situation).replace(' ', '_')}-{task.seed}.zip"
-    if not path.exists():
-        agent = FAMLE(
-            "ant",
-            seed=task.seed,
-            device="cpu",
-            compose=False,
-            transitions_per_situation=20_000,
-            joint_iterations=3000,
-            rounds=4,
-            round_transitions=2000,
-            round_iterations=2000,
-        )
-        agent.meta_learn([task.situation]).save(path)
-    return FAMLE.load(path, device="cpu")
+    return from_cache(agent, path, lambda agent: agent.meta_learn([task.situation]))
 
 
 def without_embeddings(task: Task) -> FAMLE:
     """One model of all situations, as FAMLE after two rounds; it can only follow by gradient steps on theta."""
+    settings, n = known_robots()["ant"].hyperparameters("ours"), len(AntEnv.training_situations)
+    budget: dict[str, Any] = {
+        "rounds": 2,
+        "transitions_per_situation": n * settings.transitions_per_situation,
+        "round_transitions": n * settings.round_transitions,
+    }
+    agent = FAMLE("ant", seed=0, device="cpu", pretrained=False, compose=False, **budget, **ADAPTS)
     path = task.cache / "ant-without-embeddings.zip"
-    agent = FAMLE("ant", seed=0, device="cpu", compose=False)
-    if not path.exists():
-        settings, n = agent.hyperparameters, len(AntEnv.training_situations)
-        mixed = FAMLE(
-            "ant",
-            seed=0,
-            device="cpu",
-            compose=False,
-            rounds=2,
-            transitions_per_situation=n * settings.transitions_per_situation,
-            round_transitions=n * settings.round_transitions,
-        )
-        mixed.meta_learn([lambda: RandomSituation(gym.make(ENV_ID))], folder=path.with_suffix("")).save(path)
-    return FAMLE.load(path, device="cpu", **ADAPTS)
+    mixed = [lambda: RandomSituation(gym.make(ENV_ID))]
+    return from_cache(agent, path, lambda agent: agent.meta_learn(mixed, folder=path.with_suffix("")))
 
 
 def in_step(tasks: Sequence[Task], **overrides: Any) -> FAMLE:

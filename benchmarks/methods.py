@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import torch
@@ -21,6 +21,7 @@ from stable_baselines3.common.monitor import Monitor
 
 import famle_envs  # noqa: F401 (registers the robots)
 from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent, Transitions
+from famle_agent.checkpoint import load_pretrained
 from famle_agent.envs import situation_envs
 from famle_agent.hyperparameters import known_robots
 from famle_agent.policies import make_held_uniform
@@ -28,7 +29,9 @@ from famle_agent.transitions import collect
 from famle_envs import Situation
 from famle_envs.wrappers import RandomSituation
 
-__all__ = ["METHODS", "PPO_METHODS", "Method", "Task", "famle", "shipped"]
+__all__ = ["METHODS", "PPO_METHODS", "Method", "Task", "famle", "from_cache", "shipped"]
+
+Agent = TypeVar("Agent", bound=ModelBasedAgent)
 
 
 @dataclass(frozen=True)
@@ -95,14 +98,25 @@ class Method:
 # --- FAMLE ------------------------------------------------------------------------------------------------------------
 
 
+def from_cache(agent: Agent, path: Path, learn: Callable[[Agent], object] = lambda agent: agent.meta_learn()) -> Agent:
+    """An agent with the model in a file, where that was learnt as this agent would; else it learns one, and saves it.
+
+    How it adapts and plans is the agent's own: a model outlasts a change of these settings.
+    """
+    if path.exists():
+        load_pretrained(agent, path)
+    if agent.dynamics is None:
+        learn(agent)
+        agent.save(path)
+    return agent
+
+
 def famle(task: Task, **overrides: Any) -> FAMLE:
     """FAMLE with the model that the package ships, or where it ships none a model of the replicate's own."""
     if _is_shipped(task.robot):
         return shipped(task.robot, task.seed, **overrides)
-    path = task.cache / f"{task.robot}-ours-{task.seed}.zip"
-    if not path.exists():
-        FAMLE(task.robot, seed=task.seed, device="cpu").meta_learn().save(path)
-    return FAMLE.load(path, device="cpu", **overrides)
+    agent = FAMLE(task.robot, seed=task.seed, device="cpu", **overrides)
+    return from_cache(agent, task.cache / f"{task.robot}-ours-{task.seed}.zip")
 
 
 def shipped(robot: str, seed: int, **overrides: Any) -> FAMLE:
@@ -120,34 +134,29 @@ def oracle(task: Task) -> FAMLE:
     """
     broken = str(task.situation).replace(" ", "_")
     path = task.cache / f"{task.robot}-oracle-{task.profile or task.seed}-{broken}.zip"
-    if not path.exists():
-        (_model_of_profile if task.profile else _model_of_situation)(task).save(path)
-    return FAMLE.load(path, device="cpu")
-
-
-def _model_of_situation(task: Task) -> FAMLE:
+    if task.profile:
+        # Collected by hand: no agent meta-learns on a profile, and this one is not to be had on a real robot.
+        agent = FAMLE(task.robot, seed=0, device="cpu", pretrained=False, compose=False)
+        hold = make_held_uniform(agent.hyperparameters.action_hold)
+        return from_cache(
+            agent,
+            path,
+            lambda agent: agent.meta_learn(collect([task.make], [task.situation.label], 2000, hold, seed=0)),
+        )
     probe = FAMLE(task.robot, device="cpu", pretrained=False)
     situations = len(probe._require_env().get_attr("training_situations")[0])
     n = situations * probe.hyperparameters.transitions_per_situation
-    agent = FAMLE(task.robot, seed=task.seed, device="cpu", transitions_per_situation=n, adapt_every=0)
-    return agent.meta_learn([task.situation])
-
-
-def _model_of_profile(task: Task) -> FAMLE:
-    agent = FAMLE(task.robot, seed=0, device="cpu", pretrained=False, compose=False)
-    # Collected by hand: no agent meta-learns on a profile, and this one is not to be had on a real robot.
-    hold = make_held_uniform(agent.hyperparameters.action_hold)
-    return agent.meta_learn(collect([task.make], [task.situation.label], 2000, hold, seed=0))
+    settings: dict[str, Any] = {"pretrained": False, "transitions_per_situation": n, "adapt_every": 0}
+    agent = FAMLE(task.robot, seed=task.seed, device="cpu", **settings)
+    return from_cache(agent, path, lambda agent: agent.meta_learn([task.situation]))
 
 
 def one_simulator(task: Task) -> FAMLE:
     """An agent that knows only the intact robot in its simulator, four times as long as FAMLE knows each situation."""
-    path = task.cache / f"{task.robot}-one-simulator.zip"
-    if not path.exists():
-        n = 4 * known_robots()[task.robot].hyperparameters("ours").transitions_per_situation
-        agent = FAMLE(task.robot, seed=0, device="cpu", pretrained=False, compose=False, transitions_per_situation=n)
-        agent.meta_learn(["intact"]).save(path)
-    return FAMLE.load(path, device="cpu", adapt_every=0)
+    n = 4 * known_robots()[task.robot].hyperparameters("ours").transitions_per_situation
+    settings: dict[str, Any] = {"pretrained": False, "transitions_per_situation": n, "compose": False, "adapt_every": 0}
+    agent = FAMLE(task.robot, seed=0, device="cpu", **settings)
+    return from_cache(agent, task.cache / f"{task.robot}-one-simulator.zip", lambda agent: agent.meta_learn(["intact"]))
 
 
 ANEW: Mapping[str, Any] = {"keep_adapting": False, "memory_size": 10, "selection_size": 0, "adapt_batch_size": 0}
@@ -181,10 +190,10 @@ class MetaTrained:
 
     def agent(self, task: Task) -> ModelBasedAgent:
         """The agent of a replicate."""
-        path = self.learn(task)
+        many = self.learn(task)
         if _is_shipped(task.robot):
-            return self.cls.load(path, device="cpu")
-        many, one = self.cls.load(path, device="cpu"), self._new(task.robot, task.seed)
+            return many
+        one = self._new(task.robot, task.seed)
         one.situations = many.situations
         one.dynamics = many._require_dynamics().with_members(1, first=task.seed % self.networks)
         return one
@@ -198,9 +207,9 @@ class MetaTrained:
         agent = self.agent(tasks[0])
         if _is_shipped(tasks[0].robot):
             return agent
-        many = self.cls.load(self.learn(tasks[0]), device="cpu")._require_dynamics()
         if not agent.hyperparameters.keep_adapting:
             raise ValueError(f"The robots of {self.name} do not keep their networks; run them one by one.")
+        many = self.learn(tasks[0])._require_dynamics()
         rows = torch.tensor([task.seed % self.networks for task in tasks])
         state = agent._state_of(len(tasks))
         theta = {name: value[rows] for name, value in many.parameters_by_name().items()}
@@ -208,14 +217,15 @@ class MetaTrained:
         agent._live = replace(state, belief=belief)
         return agent
 
-    def learn(self, task: Task) -> Path:
-        """The file of the agents of all replicates, which is made where it is not there."""
-        path = task.cache / f"{task.robot}-{self.name}.zip"
-        if not path.exists():
-            members = {} if _is_shipped(task.robot) else {"members": self.networks}
-            data = _simulated_data(task) if self.mode == "ours" else None
-            self._new(task.robot, seed=0, **members).meta_learn(data, progress_bar=True, n_jobs=-1).save(path)
-        return path
+    def learn(self, task: Task) -> ModelBasedAgent:
+        """The agent with the networks of all replicates, from the cache where it has been learnt before."""
+        members = {} if _is_shipped(task.robot) else {"members": self.networks}
+        agent = self._new(task.robot, seed=0, **members)
+        return from_cache(agent, task.cache / f"{task.robot}-{self.name}.zip", partial(self._learn, task=task))
+
+    def _learn(self, agent: ModelBasedAgent, task: Task) -> None:
+        data = _simulated_data(task) if self.mode == "ours" else None
+        agent.meta_learn(data, progress_bar=True, n_jobs=-1)
 
     def _new(self, robot: str, seed: int, **more: Any) -> ModelBasedAgent:
         return self.cls(robot, self.mode, seed=seed, device="cpu", pretrained=False, **{**self.settings, **more})

@@ -187,7 +187,7 @@ def restore_agent(agent: ModelBasedAgent, file: File) -> None:
 
 
 def load_pretrained(agent: ModelBasedAgent, file: File) -> None:
-    """Gives an agent the model of a shipped one, if that is of the same kind, environment and settings of learning."""
+    """Gives an agent the model of a stored one, if that is of the same kind, environment and settings of learning."""
     meta, tensors = read_checkpoint(file)
     alike = (
         meta["class"] == type(agent).__name__
@@ -197,7 +197,7 @@ def load_pretrained(agent: ModelBasedAgent, file: File) -> None:
     )
     if alike:
         agent.situations = tuple(meta["situations"])
-        weights = {name: value for name, value in tensors.items() if name.startswith("dynamics/")}
+        weights = {name: value for name, value in tensors.items() if name.startswith(("dynamics/", "reward/"))}
         _restore_tensors(agent, weights, None)
 
 

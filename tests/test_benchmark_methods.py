@@ -142,6 +142,32 @@ def test_every_benchmark_knows_its_methods() -> None:
     assert {name for name, method in METHODS.items() if method.fleet is not None} == set(IN_STEP)
 
 
+@pytest.mark.parametrize(
+    ("changed", "again"),
+    [({"memory_size": 3, "planner": "mppi"}, False), ({"hidden": [9]}, True), ({"inner_lr": 0.5}, True)],
+)
+@pytest.mark.parametrize("method", ["famle", "oracle", "one-simulator", "famle-paper", "ampc-maml"])
+def test_cached_model_outlasts_all_settings_but_those_of_its_learning(
+    method: str,
+    changed: dict[str, Any],
+    again: bool,
+    tmp_path: Path,
+    watched: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    METHODS[method].agent(task_of(0, tmp_path))
+    watched.clear()
+    robot = known_robots()["reacher"]
+    for settings in (*robot.modes.values(), *robot.rivals.values()):
+        for name, value in changed.items():
+            monkeypatch.setitem(settings, name, value)
+    agent: Any = METHODS[method].agent(task_of(0, tmp_path))
+    assert bool(watched) == again
+    assert agent.hyperparameters.to_dict().items() >= changed.items()
+    METHODS[method].agent(task_of(0, tmp_path))
+    assert len(watched) == again
+
+
 def test_model_that_is_not_shipped_is_named() -> None:
     with pytest.raises(RuntimeError, match="famle meta-learn --robot reacher"):
         methods.shipped("reacher", seed=0)
@@ -157,7 +183,7 @@ def test_replicates_take_turns_with_the_networks_of_one_ensemble(
     recipe = MetaTrained("name", cls, networks=3, settings=own)
     agents: list[Any] = [recipe.agent(task_of(seed, tmp_path)) for seed in (0, 1, 2, 4)]
     assert watched == [cls.__name__]
-    ensemble: Any = cls.load(recipe.learn(task_of(0, tmp_path)), device="cpu")
+    ensemble: Any = recipe.learn(task_of(0, tmp_path))
     assert ensemble.dynamics.members == 3
     for agent, seed in zip(agents, (0, 1, 2, 4), strict=True):
         assert agent.dynamics.members == agent.hyperparameters.members == 1
