@@ -128,9 +128,9 @@ def shipped(robot: str, seed: int, **overrides: Any) -> FAMLE:
 
 
 def oracle(task: Task) -> FAMLE:
-    """The upper line: a model of the very test robot, of as many random transitions as FAMLE's of all situations.
+    """The upper line: FAMLE with a model of the very test robot, of as many random transitions as of all situations.
 
-    Where the test robot has a profile, its model is of 2,000 of its gaits, and it adapts all the same.
+    Where the test robot has a profile, its model is of 2,000 of its gaits. It adapts all the same.
     """
     broken = str(task.situation).replace(" ", "_")
     path = task.cache / f"{task.robot}-oracle-{task.profile or task.seed}-{broken}.zip"
@@ -146,8 +146,7 @@ def oracle(task: Task) -> FAMLE:
     probe = FAMLE(task.robot, device="cpu", pretrained=False)
     situations = len(probe._require_env().get_attr("training_situations")[0])
     n = situations * probe.hyperparameters.transitions_per_situation
-    settings: dict[str, Any] = {"pretrained": False, "transitions_per_situation": n, "adapt_every": 0}
-    agent = FAMLE(task.robot, seed=task.seed, device="cpu", **settings)
+    agent = FAMLE(task.robot, seed=task.seed, device="cpu", pretrained=False, transitions_per_situation=n)
     return from_cache(agent, path, lambda agent: agent.meta_learn([task.situation]))
 
 

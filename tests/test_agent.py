@@ -163,6 +163,7 @@ def test_episode_start_of_another_number_of_robots_is_refused(
 def test_evaluate_policy_adapts_without_a_wrapper(agent: FAMLE, make_env: MakeEnv, situation: str) -> None:
     states = []
     env = make_env(situation=situation)
+    env.reset(seed=0)
     mean, _ = evaluate_policy(
         agent,
         env,
@@ -182,6 +183,7 @@ def test_evaluate_policy_adapts_without_a_wrapper(agent: FAMLE, make_env: MakeEn
 def test_each_robot_of_a_vec_env_finds_its_own_situation(agent: FAMLE) -> None:
     broken = ["joint 3 dead", "joint 0 reversed"]
     env = DummyVecEnv([lambda name=name: gym.make("FamleReacher-v0", situation=name) for name in broken])
+    env.seed(0)
     states: list[OnlineState] = []
     evaluate_policy(agent, env, n_eval_episodes=2, warn=False, callback=lambda local, _: states.append(local["states"]))
     env.close()
