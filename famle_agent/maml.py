@@ -75,7 +75,7 @@ class MAML:
             c = drawn[:meta_batch_size].to(data.x.device)
             support, query = self._sample(data, c.repeat_interleave(model.members), generator)
 
-            theta, h = expand(dict(model.theta.items()), meta_batch_size), model.embeddings_of(c)
+            theta, h = expand(dict(model.theta.items()), meta_batch_size), model.embeddings_of(c).detach()
             theta_tilde, loss_before = self._adapt(model, theta, h, support, inner_loop)
             loss_after = model.loss(theta_tilde, h, query).mean()
 
@@ -96,16 +96,18 @@ class MAML:
         self, model: Dynamics, theta: Theta, h: Tensor, support: Batch, inner_loop: InnerLoop
     ) -> tuple[Theta, Tensor]:
         """theta~ = U^k(theta) as a function of theta, to be differentiated, and the loss before it, (B,)."""
+
+        def loss_of(theta: Theta) -> tuple[Tensor, Tensor]:
+            loss = model.loss(theta, h, support)
+            return loss.sum(), loss.detach()
+
         losses = []
         for _ in range(inner_loop.steps):
-            loss = model.loss(theta, h, support)
-            # Without a graph of their own, the gradients are constants: theta~ = theta + b, eq. 5.
-            gradients = torch.autograd.grad(loss.sum(), list(theta.values()), create_graph=not self.first_order)
-            theta = {
-                name: value - inner_loop.lr * gradient
-                for (name, value), gradient in zip(theta.items(), gradients, strict=True)
-            }
-            losses.append(loss.detach())
+            # At a copy of theta, the gradients are constants: theta~ = theta + b, eq. 5.
+            at = {name: value.detach() for name, value in theta.items()} if self.first_order else theta
+            gradients, loss = torch.func.grad(loss_of, has_aux=True)(at)
+            theta = {name: value - inner_loop.lr * gradients[name] for name, value in theta.items()}
+            losses.append(loss)
         return theta, losses[0]
 
     def _shorten_gradients(self, model: Dynamics) -> None:

@@ -39,7 +39,8 @@ def pendulum(**kwargs: Any) -> FAMLE:
 @pytest.fixture(scope="module")
 def learned() -> FAMLE:
     """An agent for an environment that knows nothing of situations and does not say how it rewards."""
-    return pendulum(meta_iterations=100, memory_size=20).meta_learn([lambda g=g: gym.make("Pendulum-v1", g=g) for g in GRAVITIES])
+    agent = pendulum(meta_iterations=100, memory_size=20)
+    return agent.meta_learn([lambda g=g: gym.make("Pendulum-v1", g=g) for g in GRAVITIES])
 
 
 # --- environments that know nothing of us -----------------------------------------------------------------
