@@ -19,6 +19,7 @@ from typing_extensions import Self
 from famle_agent.adaptation import Belief
 from famle_agent.checkpoint import File, load_agent, load_pretrained, restore_agent, save_agent
 from famle_agent.dashboard import log_posterior
+from famle_agent.inner_loop import prepare_torch
 from famle_agent.memory import Memory, Sample, minibatches, whole_memory
 from famle_agent.online import OnlineLoop, OnlineState
 from famle_agent.planning import Model, Planner, RewardFn, bounded
@@ -48,6 +49,8 @@ class ModelBasedAgent(SimulationLearner):
         super()._setup_model()
         self.planner = self.hyperparameters.make_planner()
         self._live = self._served = None
+        if self.hyperparameters.adaptation(seen=1).steps:
+            prepare_torch()
 
     @abstractmethod
     def _prior(self, robots: int) -> Belief:

@@ -14,7 +14,12 @@ from torch import Tensor
 
 from famle_agent.dynamics import Batch, Dynamics, Theta
 
-__all__ = ["InnerLoop"]
+__all__ = ["InnerLoop", "prepare_torch"]
+
+
+def prepare_torch() -> None:
+    """Has torch import now what it imports for its first optimizer: seconds for which a robot would stand still."""
+    torch.optim.SGD([torch.zeros(1, requires_grad=True)])
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -50,6 +53,23 @@ def test_memory_travels_in_the_state_and_leaves_the_agent_as_it_is(quick_agent: 
     assert state.memory.weight.sum() == 10
     assert quick_agent.belief.adaptations == 0
     assert list(quick_agent.posterior().values()) == pytest.approx([1 / 11] * 11)
+
+
+def test_a_loaded_agent_imports_nothing_while_the_robot_waits(agent_file: Path) -> None:
+    live = f"""
+import sys
+from famle_agent import FAMLE
+
+agent = FAMLE.load({str(agent_file)!r}, device="cpu", adapt_every=1)
+imported, state = set(sys.modules), None
+for _ in range(3):
+    _, state = agent.predict([0.1] * 12, state)
+assert state.belief.adaptations == 2
+print(len(set(sys.modules) - imported))
+"""
+    done = subprocess.run([sys.executable, "-c", live], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout.split()[-1]) < 20
 
 
 def test_states_are_immutable(quick_agent: FAMLE, transitions: Transitions) -> None:
