@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -33,7 +34,12 @@ def run(
         steps: Of each robot.
         saved: The file of an agent's life, which goes on from there and is saved there; a PPO's is not.
         save_every: Seconds between two savings at least; it waits for the end of an episode.
+
+    Raises:
+        ValueError: The steps do not suffice for one episode.
     """
+    if steps < (episode := gym.spec(tasks[0].env_id).max_episode_steps or 0):
+        raise ValueError(f"{steps} robot steps are no whole episode; a curve needs {episode} at least.")
     robots = [Repeatable(task.make()) for task in tasks]
     envs: list[Monitor[Any, Any]] = [Monitor(robot) for robot in robots]
     vec_env = DummyVecEnv([partial(_itself, env) for env in envs])

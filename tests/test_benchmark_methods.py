@@ -265,6 +265,14 @@ def test_same_task_same_curve(cache: Path) -> None:
     assert len(one) == 2  # the third episode has not ended
 
 
+def test_curve_needs_an_episode(cache: Path) -> None:
+    task = task_of(0, cache)
+    with pytest.raises(ValueError, match=f"{EPISODE - 1} robot steps are no whole episode.*needs {EPISODE} at least"):
+        curves.run(METHODS["famle"].agent(task), [task], EPISODE - 1)
+    (result,) = curves.run(METHODS["famle"].agent(task), [task], EPISODE)
+    assert len(result["returns"]) == 1
+
+
 def test_robots_in_step_have_damages_and_curves_of_their_own(cache: Path) -> None:
     broken = [ReacherEnv.presets["joint 3 dead"], ReacherEnv.presets["joint 0 reversed"]]
     tasks = [task_of(seed, cache, situation) for seed, situation in enumerate(broken)]
