@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -139,7 +139,7 @@ def learning_curve(agent: FAMLE, data: Transitions, seen: Sequence[int]) -> list
                 obs, action, next_obs = (torch.as_tensor(v[:, :n]) for v in (data.obs, data.action, data.next_obs))
                 log_p = candidates.log_likelihood(model, model.encode(obs, action, next_obs))
                 memory = Memory.full(obs, action, next_obs, log_p)
-                belief = Belief(belief.theta, belief.h, window_posterior(candidates, memory))
+                belief = replace(belief, log_posterior=window_posterior(candidates, memory))
                 belief = adapt(model, candidates, memory, inner_loop, belief)
             rows.append({"way": way, "seen": n, **errors(model, belief, data, max(seen))})
     return rows

@@ -107,12 +107,14 @@ class Belief:
         theta: theta*, stacked parameters, (B * P, ...).
         h: h*, (B * P, embedding_dim).
         log_posterior: Log P(candidate | memory) but for a constant, (B, C).
+        candidate: The candidate with which theta* and h* began, (B,).
         adaptations: How often the robots have adapted.
     """
 
     theta: Theta
     h: Tensor
     log_posterior: Tensor
+    candidate: Tensor
     adaptations: int = 0
 
     @property
@@ -140,19 +142,20 @@ class Belief:
 
         theta = {name: choose(value, other.theta[name]) for name, value in self.theta.items()}
         log_posterior = choose(self.log_posterior, other.log_posterior)
-        return Belief(theta, choose(self.h, other.h), log_posterior, self.adaptations)
+        candidate = choose(self.candidate, other.candidate)
+        return Belief(theta, choose(self.h, other.h), log_posterior, candidate, self.adaptations)
 
 
 def prior(model: Dynamics, candidates: Candidates, robots: int) -> Belief:
     """What B robots believe before they have seen anything: theta_meta, and the first situation's embedding."""
     theta = expand(model.parameters_by_name(), robots)
-    h = model.embeddings.detach()[:, 0].repeat(robots, 1)
-    return Belief(theta, h, candidates.log_prior.expand(robots, -1))
+    first = torch.zeros(robots, dtype=torch.long, device=model.embeddings.device)
+    return Belief(theta, model.embeddings_of(first).detach(), candidates.log_prior.expand(robots, -1), first)
 
 
 def window_posterior(candidates: Candidates, memory: Memory) -> Tensor:
-    """Log P(candidate | D_M) but for a constant, (B, C): the paper's likelihood of the last M transitions."""
-    return candidates.log_prior + (memory.log_p * memory.weight[..., None]).sum(dim=1)
+    """Log P(candidate | D_W) but for a constant, (B, C): the paper's likelihood of the last transitions."""
+    return candidates.log_prior + (memory.log_p * memory.judging[..., None]).sum(dim=1)
 
 
 def filtered_posterior(candidates: Candidates, log_posterior: Tensor, log_p: Tensor, hazard: float) -> Tensor:
@@ -173,11 +176,11 @@ def filtered_posterior(candidates: Candidates, log_posterior: Tensor, log_p: Ten
 
 
 def better_explained(memory: Memory, candidate: Tensor) -> Tensor:
-    """Whether theta_meta with a candidate (B,) explains transitions better than what each robot believed then, (B,).
+    """Whether theta_meta with a candidate (B,) explains the last transitions better than the robots' beliefs did, (B,).
 
     Both are judged by transitions that no gradient step had seen when they were made.
     """
-    return ((memory.explained_by(candidate) - memory.own_log_p) * memory.weight).sum(dim=1) > 0.0
+    return ((memory.explained_by(candidate) - memory.own_log_p) * memory.judging).sum(dim=1) > 0.0
 
 
 def systematic_sample(posterior: Tensor, n: int, offset: float) -> Tensor:
@@ -233,12 +236,13 @@ def select(model: Dynamics, candidates: Candidates, belief: Belief, spread: bool
             may be the case, and a robot that is stuck tries what it would do in another one.
     """
     robots, members = len(belief.log_posterior), model.members
-    likely = belief.log_posterior.argmax(dim=1, keepdim=True).expand(-1, members)
+    likeliest = belief.log_posterior.argmax(dim=1)
+    likely = likeliest[:, None].expand(-1, members)
     if spread:
         likely = systematic_sample(belief.posterior, members, offset=belief.adaptations * _GOLDEN_RATIO % 1.0)
     h_likely = candidates.h[torch.arange(members, device=likely.device), likely].flatten(0, 1)
     theta_meta = expand(model.parameters_by_name(), robots)
-    return Belief(theta_meta, h_likely, belief.log_posterior, belief.adaptations + 1)
+    return Belief(theta_meta, h_likely, belief.log_posterior, likeliest, belief.adaptations + 1)
 
 
 @torch.no_grad()

@@ -271,8 +271,9 @@ class ModelBasedAgent(SimulationLearner):
         """What the agent believes now where that fits the number of robots, else what it meta-learned."""
         if self._live is not None and self._live.robots == robots:
             return replace(self._live, last=None)
-        model, M, C = self._require_dynamics(), self.hyperparameters.memory_size, len(self._prior(1).log_posterior[0])
-        return self._loop().begin(Memory.empty(robots, M, model.obs_dim, model.action_dim, C, self.device))
+        model, M, W = self._require_dynamics(), self.hyperparameters.memory_size, self.hyperparameters.selection_window
+        C = self._prior(1).log_posterior.shape[1]
+        return self._loop().begin(Memory.empty(robots, M, model.obs_dim, model.action_dim, C, self.device, W))
 
     # --- saving and loading -----------------------------------------------------------------------------
 

@@ -46,7 +46,7 @@ class _OneModelAgent(ModelBasedAgent):
         model = self._require_dynamics()
         c = torch.zeros(robots, dtype=torch.long, device=self.device)
         theta, h = expand(model.parameters_by_name(), robots), model.embeddings_of(c)
-        return Belief(theta, h, torch.zeros(robots, 1, device=self.device))
+        return Belief(theta, h, torch.zeros(robots, 1, device=self.device), c)
 
     def _log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
         nothing = torch.zeros(len(obs), device=self.device)

@@ -242,7 +242,8 @@ def _restore_tensors(agent: ModelBasedAgent, tensors: dict[str, Tensor], live: d
     if live is not None:
         state = {name: value.to(agent.device) for name, value in part("live").items()}
         settings = agent.hyperparameters
-        stored = OnlineState.from_tensors(state, **live).resized(settings.memory_size, settings.horizon)
+        stored = OnlineState.from_tensors(state, **live)
+        stored = stored.resized(settings.memory_size, settings.selection_window, settings.horizon)
         # With other candidates than the stored agent's, what it has seen cannot be judged by what it knew of them.
         comparable = stored.belief.log_posterior.shape == agent._prior(stored.robots).log_posterior.shape
         agent._live = stored if comparable else None

@@ -23,6 +23,7 @@ from famle_agent.agent import ModelBasedAgent
 from famle_agent.dashboard import log_embeddings
 from famle_agent.memory import Memory
 from famle_agent.online import OnlineState
+from famle_agent.planning import Model
 from famle_agent.transitions import Transitions
 
 __all__ = ["FAMLE"]
@@ -106,12 +107,22 @@ class FAMLE(ModelBasedAgent):
 
     def _adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
         """Algorithm 2, lines 6 and 7: the most likely embedding, then k gradient steps on theta and h."""
-        settings, model = self.hyperparameters, self._require_dynamics()
-        start = select(model, self._candidates(), belief, settings.spread_members)
+        settings, model, start = self.hyperparameters, self._require_dynamics(), self._selected(belief)
         if settings.keep_adapting:
-            likely = belief.log_posterior.argmax(dim=1)
-            anew = better_explained(self._window(memory), likely)
-            memory = memory.begun_anew(anew, settings.selection_window, likely)
-            start = start.where(anew, replace(belief, adaptations=start.adaptations))
+            better = better_explained(self._window(memory), start.candidate)
+            changed = better & (start.candidate != belief.candidate)
+            memory = memory.begun_anew(changed, settings.selection_window, start.candidate)
+            start = start.where(changed, replace(belief, adaptations=start.adaptations))
         steps = settings.adaptation(memory.seen)
         return memory, descend(model, start, memory, steps, settings.validation_size, self._sample(belief))
+
+    def _simulator(self, belief: Belief, memory: Memory) -> Model:
+        """Where steps go on, they may lead astray for a while: until they are of use, the embedding alone plans."""
+        if self.hyperparameters.keep_adapting:
+            selected = replace(self._selected(belief), adaptations=belief.adaptations)
+            belief = selected.where(better_explained(self._window(memory), selected.candidate), belief)
+        return super()._simulator(belief, memory)
+
+    def _selected(self, belief: Belief) -> Belief:
+        """Line 6: theta_meta with the most likely embedding."""
+        return select(self._require_dynamics(), self._candidates(), belief, self.hyperparameters.spread_members)

@@ -74,8 +74,9 @@ class Hyperparameters:
         adapt_batch_size: Transitions per step of online adaptation, drawn from the memory; 0 takes all, as the paper
             does.
         keep_adapting: Whether gradient steps go on from where the last ones led, instead of beginning with what was
-            meta-learned each time (the paper's). FAMLE goes on as long as no embedding explains the robot better than
-            its adapted model does; then it begins anew, with the transitions that selected the embedding alone.
+            meta-learned each time (the paper's). FAMLE begins anew where another embedding than the one it began with
+            explains the robot better than its adapted model does, with the transitions that selected it alone. Where
+            it is the same embedding, the steps go on, but the embedding alone plans as long as it explains more.
         selection_size: The newest transitions, by which the embedding is selected; 0 takes all M, as the paper does.
         adapt_lr: alpha of online adaptation; None takes ``inner_lr``.
         adapt_embedding_lr: beta of online adaptation; None takes ``embedding_lr``.

@@ -22,9 +22,10 @@ class Memory:
         obs: (B, M, obs_dim).
         action: In [-1, 1], (B, M, action_dim).
         next_obs: (B, M, obs_dim).
-        log_p: Log-likelihood of each transition under each candidate, (B, M, C). It does not change as long as
-            theta_meta does not, so that it is computed once for each transition.
-        own_log_p: Log-likelihood of each transition under what the robot believed when it happened, (B, M).
+        log_p: Log-likelihood under each candidate of the newest W transitions, by which candidates are judged,
+            (B, W, C), W <= M. It does not change as long as theta_meta does not, so that it is computed once for each
+            transition.
+        own_log_p: Log-likelihood of the same under what the robot believed when they happened, (B, W).
         weight: 1 for a transition, 0 for a place that is empty yet, (B, M).
     """
 
@@ -37,14 +38,20 @@ class Memory:
 
     @classmethod
     def empty(
-        cls, robots: int, size: int, obs_dim: int, action_dim: int, candidates: int, device: torch.device
+        cls,
+        robots: int,
+        size: int,
+        obs_dim: int,
+        action_dim: int,
+        candidates: int,
+        device: torch.device,
+        window: int | None = None,
     ) -> Memory:
-        """A memory of ``size`` M for B robots that have seen nothing."""
-        obs, action, log_p = (
-            torch.zeros(robots, size, dim, device=device) for dim in (obs_dim, action_dim, candidates)
-        )
-        nothing = torch.zeros(robots, size, device=device)
-        return cls(obs, action, obs, log_p, nothing, nothing)
+        """A memory of ``size`` M for B robots that have seen nothing; W is ``window``, None for M."""
+        window = size if window is None else min(window, size)
+        obs, action = (torch.zeros(robots, size, dim, device=device) for dim in (obs_dim, action_dim))
+        log_p = torch.zeros(robots, window, candidates, device=device)
+        return cls(obs, action, obs, log_p, log_p.new_zeros(robots, window), obs.new_zeros(robots, size))
 
     @classmethod
     def full(cls, obs: Tensor, action: Tensor, next_obs: Tensor, log_p: Tensor) -> Memory:
@@ -56,6 +63,11 @@ class Memory:
     def seen(self) -> int:
         """Transitions of the robot that has most of them."""
         return int(self.weight.sum(dim=1).max())
+
+    @property
+    def judging(self) -> Tensor:
+        """The weight of the newest W transitions, (B, W)."""
+        return self.weight[:, self.weight.shape[1] - self.own_log_p.shape[1] :]
 
     def range(self) -> tuple[Tensor, Tensor]:
         """Least and largest value of each observed number, (B, obs_dim); infinite for a robot that has seen nothing."""
@@ -70,14 +82,16 @@ class Memory:
         is_new = torch.arange(self.weight.shape[1], device=self.weight.device) >= self.weight.shape[1] - newest
         return replace(self, weight=self.weight * ~is_new), replace(self, weight=self.weight * is_new)
 
-    def resized(self, size: int) -> Memory:
-        """The newest ``size`` places, with empty ones in front where there are fewer."""
+    def resized(self, size: int, window: int) -> Memory:
+        """The newest ``size`` places, with empty ones in front where there are fewer, and ``window`` that judge."""
 
-        def fit(values: Tensor) -> Tensor:
+        def fit(values: Tensor, size: int) -> Tensor:
             empty = values.new_zeros(len(values), size, *values.shape[2:])
             return torch.cat([empty, values], dim=1)[:, -size:]
 
-        return Memory(**{name: fit(values) for name, values in vars(self).items()})
+        window = min(window, size)
+        sizes = {name: window if name in ("log_p", "own_log_p") else size for name in vars(self)}
+        return Memory(**{name: fit(values, sizes[name]) for name, values in vars(self).items()})
 
     def where(self, kept: Tensor, other: Memory) -> Memory:
         """This memory for the robots in ``kept`` (B,), and the other one for the rest."""
@@ -101,7 +115,7 @@ class Memory:
         return replace(self, own_log_p=own_log_p, weight=weight)
 
     def explained_by(self, candidate: Tensor) -> Tensor:
-        """The log-likelihood of each transition under a candidate for each robot (B,), (B, M)."""
+        """The log-likelihood of the newest W transitions under a candidate for each robot (B,), (B, W)."""
         index = candidate[:, None, None].expand(-1, self.log_p.shape[1], 1)
         return self.log_p.gather(2, index)[..., 0]
 

@@ -41,16 +41,17 @@ class OnlineState:
         """B."""
         return len(self.plan)
 
-    def resized(self, memory_size: int, horizon: int) -> OnlineState:
-        """The same for another M and H."""
+    def resized(self, memory_size: int, window: int, horizon: int) -> OnlineState:
+        """The same for another M, W and H."""
         plan = torch.cat([self.plan, torch.zeros_like(self.plan[:, :1]).repeat(1, horizon, 1)], dim=1)[:, :horizon]
-        return replace(self, memory=self.memory.resized(memory_size), plan=plan)
+        return replace(self, memory=self.memory.resized(memory_size, window), plan=plan)
 
     def to_tensors(self) -> dict[str, Tensor]:
         """All but :attr:`last` and the counts, for a checkpoint."""
         tensors = {f"theta.{name}": value for name, value in self.belief.theta.items()}
         tensors |= {f"memory.{name}": value for name, value in vars(self.memory).items()}
-        return tensors | {"h": self.belief.h, "log_posterior": self.belief.log_posterior, "plan": self.plan}
+        belief = {name: getattr(self.belief, name) for name in ("h", "log_posterior", "candidate")}
+        return tensors | belief | {"plan": self.plan}
 
     @classmethod
     def from_tensors(cls, tensors: dict[str, Tensor], steps: int, adaptations: int) -> OnlineState:
@@ -59,7 +60,7 @@ class OnlineState:
         def part(prefix: str) -> dict[str, Tensor]:
             return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
-        belief = Belief(part("theta."), tensors["h"], tensors["log_posterior"], adaptations)
+        belief = Belief(part("theta."), tensors["h"], tensors["log_posterior"], tensors["candidate"], adaptations)
         return cls(Memory(**part("memory.")), belief, tensors["plan"], steps=steps)
 
 

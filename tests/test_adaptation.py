@@ -340,14 +340,15 @@ def test_prior_is_the_first_situation_and_all_are_as_likely(model: Dynamics, can
 def make_belief(value: float, adaptations: int, members: int = 1) -> Belief:
     rows = 3 * members
     theta = {"weight_0": torch.full((rows, 2, 2), value), "bias_0": torch.full((rows, 2), value)}
-    return Belief(theta, torch.full((rows, 4), value), torch.full((3, 5), value), adaptations)
+    h, log_posterior, candidate = torch.full((rows, 4), value), torch.full((3, 5), value), torch.full((3,), int(value))
+    return Belief(theta, h, log_posterior, candidate, adaptations)
 
 
 @given(st.lists(st.booleans(), min_size=3, max_size=3), st.integers(1, 3))
 def test_beliefs_are_mixed_by_robot(kept: list[bool], members: int) -> None:
     mixed = make_belief(1.0, 4, members).where(torch.tensor(kept), make_belief(2.0, 0, members))
     expected = [1.0 if keep else 2.0 for keep in kept]
-    for value in (*mixed.theta.values(), mixed.h, mixed.log_posterior):
+    for value in (*mixed.theta.values(), mixed.h, mixed.log_posterior, mixed.candidate[:, None]):
         rows = [number for number in expected for _ in range(len(value) // 3)]
         assert value.flatten(1).amax(dim=1).tolist() == value.flatten(1).amin(dim=1).tolist() == rows
     assert mixed.adaptations == 4

@@ -1,4 +1,4 @@
-"""FAMLE with ``keep_adapting``: on from theta* and h*, anew where an embedding explains the robot better."""
+"""FAMLE with ``keep_adapting``: on from theta* and h*, anew where another embedding explains the robot better."""
 
 from __future__ import annotations
 
@@ -71,10 +71,12 @@ def memory(agent: FAMLE) -> Memory:
 
 
 def random_memory(robots: int, size: int, candidates: int, seed: int) -> Memory:
-    chance = torch.Generator().manual_seed(seed)
-    obs, action, next_obs, log_p = (torch.randn(robots, size, n, generator=chance) for n in (2, 1, 2, candidates))
-    own, weight = torch.randn(robots, size, generator=chance), torch.rand(robots, size, generator=chance) > 0.3
-    return Memory(obs, action, next_obs, log_p, own, weight.float())
+    """Places of which some are empty; as many of the newest judge as the seed says."""
+    chance, window = torch.Generator().manual_seed(seed), 1 + seed % size
+    obs, action, next_obs = (torch.randn(robots, size, n, generator=chance) for n in (2, 1, 2))
+    log_p, own = (torch.randn(robots, window, n, generator=chance) for n in (candidates, 1))
+    weight = torch.rand(robots, size, generator=chance) > 0.3
+    return Memory(obs, action, next_obs, log_p, own[..., 0], weight.float())
 
 
 sizes = st.integers(1, 4), st.integers(1, 7), st.integers(1, 3), st.integers(0, 99)
@@ -106,7 +108,7 @@ def test_candidate_is_better_where_it_explains_what_counts_better(
     seen, candidate = random_memory(robots, size, candidates, seed), torch.randint(candidates, (robots,))
     better = better_explained(seen, candidate)
     for robot in range(robots):
-        counts = seen.weight[robot] == 1
+        counts = seen.weight[robot, -seen.own_log_p.shape[1] :] == 1
         theirs, own = seen.log_p[robot, counts, candidate[robot]].sum(), seen.own_log_p[robot, counts].sum()
         assert better[robot] == (theirs > own) or torch.isclose(theirs, own)
 
@@ -118,9 +120,36 @@ def test_what_explains_as_well_as_the_belief_is_not_better(robots: int, size: in
     assert not better_explained(seen.begun_anew(everyone, size, candidate), candidate).any()
 
 
+@given(*sizes, st.integers(1, 9), st.integers(1, 9))
+def test_resized_memory_keeps_the_newest(
+    robots: int, size: int, candidates: int, seed: int, new_size: int, window: int
+) -> None:
+    old = random_memory(robots, size, candidates, seed)
+    new = old.resized(new_size, window)
+    assert new.weight.shape == (robots, new_size)
+    assert new.log_p.shape == (robots, min(window, new_size), candidates)
+    for name, values in vars(old).items():
+        fitted = getattr(new, name)
+        both = min(values.shape[1], fitted.shape[1])
+        assert torch.equal(fitted[:, fitted.shape[1] - both :], values[:, values.shape[1] - both :])
+        assert not fitted[:, : fitted.shape[1] - both].any()
+
+
+@given(*sizes)
+def test_only_what_judges_has_a_likelihood(robots: int, size: int, candidates: int, seed: int) -> None:
+    seen = random_memory(robots, size, candidates, seed)
+    window, new = seen.own_log_p.shape[1], torch.rand(robots, candidates)
+    log_p, own = torch.cat([seen.log_p, new[:, None]], dim=1), torch.cat([seen.own_log_p, new[:, :1]], dim=1)
+    everyone = torch.ones(robots, dtype=torch.bool)
+    seen = seen.add(seen.obs[:, 0], seen.action[:, 0], seen.obs[:, 0], new, new[:, 0], valid=everyone)
+    assert torch.equal(seen.log_p, log_p[:, -window:])
+    assert torch.equal(seen.own_log_p, own[:, -window:])
+    assert torch.equal(seen.judging, seen.weight[:, size - window :])
+
+
 @given(st.lists(st.booleans(), min_size=1, max_size=4))
 def test_memories_are_mixed_by_robot(kept: list[bool]) -> None:
-    mine, theirs = (random_memory(len(kept), 3, 2, seed) for seed in (0, 1))
+    mine, theirs = (random_memory(len(kept), 3, 2, seed) for seed in (1, 4))
     mixed = mine.where(torch.tensor(kept), theirs)
     for robot, keep in enumerate(kept):
         for name, values in vars(mixed).items():
@@ -192,6 +221,45 @@ def test_agent_begins_anew_where_the_situation_changes(load: Load, data: Transit
     assert max(agent.posterior(), key=lambda name: agent.posterior()[name]) == "joint 0 reversed"
 
 
+def imagined(agent: FAMLE, belief: Belief, data: Transitions) -> Tensor:
+    """What a planner with a belief expects of some actions."""
+    obs, action = (torch.as_tensor(values[DEAD, :20])[None] for values in (data.obs, data.action))
+    return agent._require_dynamics().simulator(belief.theta, belief.h)(obs, action)
+
+
+def planned_with(agent: FAMLE, data: Transitions) -> Tensor:
+    """The same of the model that the agent plans with."""
+    obs, action = (torch.as_tensor(values[DEAD, :20])[None] for values in (data.obs, data.action))
+    return agent._simulator(agent.belief, memory(agent))(obs, action)
+
+
+def test_adapted_model_plans_where_no_embedding_is_better(load: Load, data: Transitions) -> None:
+    agent = load()
+    tell(agent, data, [STRANGE], range(30))
+    assert not better_explained(memory(agent), agent.belief.log_posterior.argmax(dim=1)).any()
+    torch.testing.assert_close(planned_with(agent, data), imagined(agent, agent.belief, data))
+
+
+def test_embedding_alone_plans_while_steps_lead_astray_and_nothing_is_forgotten(load: Load, data: Transitions) -> None:
+    agent = load(adapt_lr=0.3)
+    tell(agent, data, [DEAD], range(30))
+    selected = select(agent._require_dynamics(), agent._candidates(), agent.belief)
+    assert better_explained(memory(agent), selected.candidate).all()
+    assert selected.candidate.tolist() == agent.belief.candidate.tolist() == [DEAD]
+    assert memory(agent).seen > 2 * WINDOW
+    torch.testing.assert_close(planned_with(agent, data), imagined(agent, selected, data))
+    assert not torch.allclose(imagined(agent, agent.belief, data), imagined(agent, selected, data))
+
+
+def test_belief_remembers_with_which_embedding_it_began(load: Load, data: Transitions) -> None:
+    agent = load()
+    assert agent.belief.candidate.tolist() == [0]
+    tell(agent, data, [DEAD], range(12))
+    assert agent.belief.candidate.tolist() == [DEAD]
+    tell(agent, data, [REVERSED], range(12, 30))
+    assert agent.belief.candidate.tolist() == [REVERSED]
+
+
 def test_each_robot_goes_on_or_begins_anew_by_itself(load: Load, data: Transitions) -> None:
     together, alone = load(), [load(), load()]
     for situations, steps in (([STRANGE, STRANGE], range(30)), ([STRANGE, REVERSED], range(30, 39))):
@@ -222,4 +290,5 @@ def test_agent_that_goes_on_is_saved_with_what_it_knows(load: Load, data: Transi
     assert torch.equal(memory(agent).own_log_p, memory(loaded).own_log_p)
     assert torch.equal(memory(agent).weight, memory(loaded).weight)
     torch.testing.assert_close(agent.belief.h, loaded.belief.h)
+    assert torch.equal(agent.belief.candidate, loaded.belief.candidate)
     loaded.get_env().close()
