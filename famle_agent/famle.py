@@ -99,18 +99,13 @@ class FAMLE(ModelBasedAgent):
         if hazard := self.hyperparameters.hazard:
             new = filtered_posterior(self._candidates(), belief.log_posterior, memory.log_p[:, -1], hazard)
             return replace(belief, log_posterior=torch.where(moved[:, None], new, belief.log_posterior))
-        return replace(belief, log_posterior=window_posterior(self._candidates(), self._window(memory)))
-
-    def _window(self, memory: Memory) -> Memory:
-        """The transitions by which an embedding is selected."""
-        return memory.split(self.hyperparameters.selection_window)[1]
+        return replace(belief, log_posterior=window_posterior(self._candidates(), memory))
 
     def _adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
         """Algorithm 2, lines 6 and 7: the most likely embedding, then k gradient steps on theta and h."""
         settings, model, start = self.hyperparameters, self._require_dynamics(), self._selected(belief)
         if settings.keep_adapting:
-            better = better_explained(self._window(memory), start.candidate)
-            changed = better & (start.candidate != belief.candidate)
+            changed = better_explained(memory, start.candidate) & (start.candidate != belief.candidate)
             memory = memory.begun_anew(changed, settings.selection_window, start.candidate)
             start = start.where(changed, replace(belief, adaptations=start.adaptations))
         steps = settings.adaptation(memory.seen)
@@ -119,8 +114,9 @@ class FAMLE(ModelBasedAgent):
     def _simulator(self, belief: Belief, memory: Memory) -> Model:
         """Where steps go on, they may lead astray for a while: until they are of use, the embedding alone plans."""
         if self.hyperparameters.keep_adapting:
-            selected = replace(self._selected(belief), adaptations=belief.adaptations)
-            belief = selected.where(better_explained(self._window(memory), selected.candidate), belief)
+            better = better_explained(memory, belief.log_posterior.argmax(dim=1))
+            if better.any():
+                belief = replace(self._selected(belief).where(better, belief), adaptations=belief.adaptations)
         return super()._simulator(belief, memory)
 
     def _selected(self, belief: Belief) -> Belief:
