@@ -1,7 +1,6 @@
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +12,9 @@ from torch import Tensor
 
 from famle_agent import FAMLE, Transitions
 from famle_agent.adaptation import Belief, Candidates, adapt, descend, prior, select, window_posterior
-from famle_agent.dynamics import Batch, Dynamics
+from famle_agent.dynamics import Dynamics
 from famle_agent.inner_loop import InnerLoop
-from famle_agent.memory import Memory, Sample, minibatches, whole_memory
+from famle_agent.memory import Memory, Sample, minibatches
 from tests.helpers import adapted, memory_of
 
 INNER_LOOP = InnerLoop(steps=10, lr=1e-3, embedding_lr=0.05, optimizer="adam")
@@ -47,164 +46,6 @@ def candidates(model: Dynamics) -> Candidates:
 def tensors_of(transitions: Transitions, rows: slice = slice(None)) -> list[Tensor]:
     """One robot per situation, with all of its transitions."""
     return [torch.from_numpy(getattr(transitions, name)[rows]) for name in ("obs", "action", "next_obs")]
-
-
-def transition(value: float, robots: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    one = torch.full((robots, 1), value)
-    return one, one + 0.1, one + 0.2, torch.cat([one + 0.3, one + 0.4], dim=1), one[:, 0] + 0.5
-
-
-# --- the memory -------------------------------------------------------------------------------------------
-
-
-@given(
-    st.integers(1, 5),
-    st.integers(1, 3).flatmap(
-        lambda robots: st.lists(st.lists(st.booleans(), min_size=robots, max_size=robots), max_size=12)
-    ),
-)
-def test_memory_keeps_the_last_transitions_in_order(size: int, valid: list[list[bool]]) -> None:
-    robots = len(valid[0]) if valid else 1
-    memory = Memory.empty(robots, size, obs_dim=1, action_dim=1, candidates=2, device=CPU)
-    expected: list[deque[float]] = [deque(maxlen=size) for _ in range(robots)]
-    for step, flags in enumerate(valid, start=1):
-        memory = memory.add(*transition(float(step), robots), torch.tensor(flags))
-        for robot in range(robots):
-            if flags[robot]:
-                expected[robot].append(float(step))
-    for robot in range(robots):
-        filled = memory.weight[robot] == 1
-        assert memory.weight[robot].tolist() == [0.0] * (size - len(expected[robot])) + [1.0] * len(expected[robot])
-        obs = torch.tensor(expected[robot])
-        torch.testing.assert_close(memory.obs[robot, filled, 0], obs)
-        torch.testing.assert_close(memory.action[robot, filled, 0], obs + 0.1)
-        torch.testing.assert_close(memory.next_obs[robot, filled, 0], obs + 0.2)
-        torch.testing.assert_close(memory.log_p[robot, filled], torch.stack([obs + 0.3, obs + 0.4], dim=1))
-        torch.testing.assert_close(memory.own_log_p[robot, filled], obs + 0.5)
-
-
-def test_adding_leaves_the_old_memory_as_it_is() -> None:
-    memory = Memory.empty(1, 3, 1, 1, 2, CPU)
-    memory.add(*transition(1.0, 1), torch.tensor([True]))
-    assert memory.weight.sum() == 0
-    assert memory.obs.sum() == 0
-    assert memory.log_p.sum() == 0
-
-
-memories = st.integers(1, 4).flatmap(
-    lambda robots: st.lists(st.lists(st.booleans(), min_size=robots, max_size=robots), min_size=1, max_size=9)
-)
-"""Which robots have a transition at each step, for memories of 5."""
-
-
-def remembered(valid: list[list[bool]]) -> tuple[Memory, list[list[Tensor]]]:
-    """A memory of 5, and what stands in it: the observations of each robot's last transitions, (2, 3) each."""
-    torch.manual_seed(len(valid))
-    robots = len(valid[0])
-    memory, seen = Memory.empty(robots, 5, 3, 1, 2, CPU), [list[Tensor]() for _ in range(robots)]
-    for flags in valid:
-        obs, next_obs, action, log_p = (torch.randn(robots, size) for size in (3, 3, 1, 2))
-        memory = memory.add(obs, action, next_obs, log_p, torch.randn(robots), torch.tensor(flags))
-        for robot in range(robots):
-            seen[robot] += [torch.stack([obs[robot], next_obs[robot]])] * flags[robot]
-    return memory, [rows[-5:] for rows in seen]
-
-
-@given(memories)
-def test_memory_knows_how_much_it_has_seen_and_how_far_it_went(valid: list[list[bool]]) -> None:
-    memory, seen = remembered(valid)
-    assert memory.seen == max(len(rows) for rows in seen)
-    low, high = memory.range()
-    for robot, rows in enumerate(seen):
-        if rows:
-            assert torch.equal(low[robot], torch.cat(rows).amin(dim=0))
-            assert torch.equal(high[robot], torch.cat(rows).amax(dim=0))
-        else:
-            assert (low[robot] == -torch.inf).all()
-            assert (high[robot] == torch.inf).all()
-
-
-# --- what a gradient step sees ----------------------------------------------------------------------------
-
-
-def numbered(weight: Tensor) -> Memory:
-    """Transitions whose observations say which they are."""
-    obs = torch.arange(weight.numel(), dtype=torch.float32).view(*weight.shape, 1)
-    return replace(Memory.full(obs, torch.zeros_like(obs), obs + 1.0, torch.zeros_like(obs)), weight=weight)
-
-
-def model_of(members: int = 1) -> Dynamics:
-    """A model that sees observations as they are."""
-    return Dynamics(obs_dim=1, action_dim=1, n_situations=1, members=members)
-
-
-def numbers(batch: Batch) -> Tensor:
-    """Which transitions there are in a batch, (rows, n)."""
-    return batch.x[..., 0]
-
-
-weights = st.lists(st.lists(st.booleans(), min_size=6, max_size=6), min_size=1, max_size=3)
-
-
-@given(weights, st.integers(1, 8), st.integers(1, 2), st.integers(0, 99))
-def test_minibatch_holds_what_counts_of_each_robot(
-    robots: list[list[bool]], size: int, members: int, seed: int
-) -> None:
-    memory = numbered(torch.tensor(robots, dtype=torch.float32))
-    batch = minibatches(size, torch.Generator().manual_seed(seed))(model_of(members), memory)()
-    drawn = numbers(batch)
-    assert drawn.shape == (len(robots) * members, size)
-    assert (batch.y == 1.0).all()
-    for row in range(len(drawn)):
-        counted = memory.obs[row // members, memory.weight[row // members] == 1]
-        if len(counted):
-            assert (batch.weight[row] == 1).all()
-            assert set(drawn[row].tolist()) <= set(counted.flatten().tolist())
-        else:
-            assert (batch.weight[row] == 0).all()  # nothing that could be learnt from
-
-
-@given(weights)
-def test_all_that_counts_is_drawn_as_often(robots: list[list[bool]]) -> None:
-    memory = numbered(torch.tensor(robots, dtype=torch.float32))
-    batch = minibatches(3000, torch.Generator().manual_seed(0))(model_of(), memory)()
-    for row, weight in enumerate(memory.weight):
-        counts = torch.bincount(numbers(batch)[row].long() - 6 * row, minlength=6) * batch.weight[row].mean()
-        torch.testing.assert_close(counts, 3000 * weight / weight.sum().clamp(min=1), rtol=0.2, atol=0.0)
-
-
-def test_rows_and_steps_draw_by_themselves() -> None:
-    memory = numbered(torch.ones(2, 50))
-
-    def draws(members: int = 1) -> Callable[[], Batch]:
-        return minibatches(20, torch.Generator().manual_seed(0))(model_of(members), memory)
-
-    draw, again = draws(), draws()
-    one, other = numbers(draw()), numbers(draw())
-    assert not torch.equal(one[0], one[1] - 50)
-    assert not torch.equal(one, other)
-    assert torch.equal(numbers(again()), one)
-    of_members = numbers(draws(members=2)())
-    assert not torch.equal(of_members[0], of_members[1])
-
-
-def test_whole_memory_is_what_each_member_sees_each_time() -> None:
-    memory = numbered(torch.tensor([[0.0, 1.0, 1.0], [1.0, 1.0, 1.0]]))
-    draw = whole_memory(model_of(members=2), memory)
-    batch = draw()
-    assert torch.equal(numbers(batch), memory.obs[[0, 0, 1, 1], :, 0])
-    assert torch.equal(batch.weight, memory.weight[[0, 0, 1, 1]])
-    assert draw() is batch
-
-
-@given(weights, st.integers(0, 6))
-def test_newest_transitions_are_split_off(robots: list[list[bool]], newest: int) -> None:
-    memory = numbered(torch.tensor(robots, dtype=torch.float32))
-    older, newer = memory.split(newest)
-    assert torch.equal(older.weight + newer.weight, memory.weight)
-    assert (older.weight[:, 6 - newest :] == 0).all()
-    assert (newer.weight[:, : 6 - newest] == 0).all()
-    assert torch.equal(older.obs, memory.obs)
 
 
 # --- the most likely situation ----------------------------------------------------------------------------

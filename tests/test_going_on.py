@@ -9,8 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from torch import Tensor
 
 from famle_agent import FAMLE, Transitions
@@ -65,95 +63,6 @@ def agent_units(agent: FAMLE, action: object) -> object:
 def memory(agent: FAMLE) -> Memory:
     assert agent._live is not None
     return agent._live.memory
-
-
-# --- what a memory says -----------------------------------------------------------------------------------
-
-
-def random_memory(robots: int, size: int, candidates: int, seed: int) -> Memory:
-    """Places of which some are empty; as many of the newest judge as the seed says."""
-    chance, window = torch.Generator().manual_seed(seed), 1 + seed % size
-    obs, action, next_obs = (torch.randn(robots, size, n, generator=chance) for n in (2, 1, 2))
-    log_p, own = (torch.randn(robots, window, n, generator=chance) for n in (candidates, 1))
-    weight = torch.rand(robots, size, generator=chance) > 0.3
-    return Memory(obs, action, next_obs, log_p, own[..., 0], weight.float())
-
-
-sizes = st.integers(1, 4), st.integers(1, 7), st.integers(1, 3), st.integers(0, 99)
-
-
-@given(*sizes, st.integers(0, 8))
-def test_robot_that_begins_anew_keeps_its_newest_transitions(
-    robots: int, size: int, candidates: int, seed: int, newest: int
-) -> None:
-    old = random_memory(robots, size, candidates, seed)
-    rows, candidate = torch.rand(robots) > 0.5, torch.randint(candidates, (robots,))
-    new = old.begun_anew(rows, newest, candidate)
-    for robot in range(robots):
-        kept = slice(max(0, size - newest), size)
-        if rows[robot]:
-            assert new.weight[robot].sum() == old.weight[robot, kept].sum()
-            assert torch.equal(new.weight[robot, kept], old.weight[robot, kept])
-            assert torch.equal(new.own_log_p[robot], old.log_p[robot, :, candidate[robot]])
-        else:
-            assert torch.equal(new.weight[robot], old.weight[robot])
-            assert torch.equal(new.own_log_p[robot], old.own_log_p[robot])
-    assert new.obs is old.obs
-
-
-@given(*sizes)
-def test_candidate_is_better_where_it_explains_what_counts_better(
-    robots: int, size: int, candidates: int, seed: int
-) -> None:
-    seen, candidate = random_memory(robots, size, candidates, seed), torch.randint(candidates, (robots,))
-    better = better_explained(seen, candidate)
-    for robot in range(robots):
-        counts = seen.weight[robot, -seen.own_log_p.shape[1] :] == 1
-        theirs, own = seen.log_p[robot, counts, candidate[robot]].sum(), seen.own_log_p[robot, counts].sum()
-        assert better[robot] == (theirs > own) or torch.isclose(theirs, own)
-
-
-@given(*sizes)
-def test_what_explains_as_well_as_the_belief_is_not_better(robots: int, size: int, candidates: int, seed: int) -> None:
-    seen, everyone = random_memory(robots, size, candidates, seed), torch.ones(robots, dtype=torch.bool)
-    candidate = torch.randint(candidates, (robots,))
-    assert not better_explained(seen.begun_anew(everyone, size, candidate), candidate).any()
-
-
-@given(*sizes, st.integers(1, 9), st.integers(1, 9))
-def test_resized_memory_keeps_the_newest(
-    robots: int, size: int, candidates: int, seed: int, new_size: int, window: int
-) -> None:
-    old = random_memory(robots, size, candidates, seed)
-    new = old.resized(new_size, window)
-    assert new.weight.shape == (robots, new_size)
-    assert new.log_p.shape == (robots, min(window, new_size), candidates)
-    for name, values in vars(old).items():
-        fitted = getattr(new, name)
-        both = min(values.shape[1], fitted.shape[1])
-        assert torch.equal(fitted[:, fitted.shape[1] - both :], values[:, values.shape[1] - both :])
-        assert not fitted[:, : fitted.shape[1] - both].any()
-
-
-@given(*sizes)
-def test_only_what_judges_has_a_likelihood(robots: int, size: int, candidates: int, seed: int) -> None:
-    seen = random_memory(robots, size, candidates, seed)
-    window, new = seen.own_log_p.shape[1], torch.rand(robots, candidates)
-    log_p, own = torch.cat([seen.log_p, new[:, None]], dim=1), torch.cat([seen.own_log_p, new[:, :1]], dim=1)
-    everyone = torch.ones(robots, dtype=torch.bool)
-    seen = seen.add(seen.obs[:, 0], seen.action[:, 0], seen.obs[:, 0], new, new[:, 0], valid=everyone)
-    assert torch.equal(seen.log_p, log_p[:, -window:])
-    assert torch.equal(seen.own_log_p, own[:, -window:])
-    assert torch.equal(seen.judging, seen.weight[:, size - window :])
-
-
-@given(st.lists(st.booleans(), min_size=1, max_size=4))
-def test_memories_are_mixed_by_robot(kept: list[bool]) -> None:
-    mine, theirs = (random_memory(len(kept), 3, 2, seed) for seed in (1, 4))
-    mixed = mine.where(torch.tensor(kept), theirs)
-    for robot, keep in enumerate(kept):
-        for name, values in vars(mixed).items():
-            assert torch.equal(values[robot], getattr(mine if keep else theirs, name)[robot])
 
 
 # --- life -------------------------------------------------------------------------------------------------
