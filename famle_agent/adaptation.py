@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from famle_agent.dynamics import Batch, Dynamics, Theta, expand
-from famle_agent.inner_loop import InnerLoop
+from famle_agent.inner_loop import Anchor, InnerLoop
 from famle_agent.memory import Memory, Sample, whole_memory
 
 __all__ = [
@@ -260,7 +260,7 @@ def descend(
         model: Says what the parameters mean.
         start: Its theta and h are where the steps begin, and stay where they diverge.
         memory: D_M.
-        inner_loop: The k steps.
+        inner_loop: The k steps; theta_meta is their anchor.
         validation_size: The newest transitions, which no gradient step sees. Steps that do not make them more likely
             are taken back, in each member of the ensemble by itself; 0 trusts all steps, as the paper does.
         sample: Chooses the transitions of each step among those it may see.
@@ -268,7 +268,8 @@ def descend(
     if inner_loop.steps == 0:
         return start
     seen, newest = memory.split(validation_size)
-    theta, h, _ = inner_loop(model, start.theta, start.h, sample(model, seen))
+    anchor = _theta_meta(model, seen) if inner_loop.decay else None
+    theta, h, _ = inner_loop(model, start.theta, start.h, sample(model, seen), anchor)
     if validation_size:
         batch = whole_memory(model, newest)()
         better = model.loss(theta, h, batch) < model.loss(start.theta, start.h, batch)
@@ -276,6 +277,12 @@ def descend(
         h = _choose(better, h, start.h)
     adapted = replace(start, theta=theta, h=h)
     return adapted.where(adapted.is_finite(), start)  # steps that diverged are no steps
+
+
+def _theta_meta(model: Dynamics, memory: Memory) -> Anchor:
+    """What draws the networks of B robots back, (B * P, ...)."""
+    n = memory.weight.sum(dim=1)
+    return Anchor(expand(model.parameters_by_name(), len(n)), n.repeat_interleave(model.members))
 
 
 def _choose(rows: Tensor, mine: Tensor, theirs: Tensor) -> Tensor:

@@ -80,6 +80,8 @@ class Hyperparameters:
         selection_size: The newest transitions, by which the embedding is selected; 0 takes all M, as the paper does.
         adapt_lr: alpha of online adaptation; None takes ``inner_lr``.
         adapt_embedding_lr: beta of online adaptation; None takes ``embedding_lr``.
+        adapt_decay: c; after n transitions, each gradient step takes theta c / n of the way back to theta_meta, so that
+            it goes far only where much was seen; 0, the paper's, trusts few transitions as much as many.
         validation_size: The newest transitions of the memory, which gradient steps do not see and which decide whether
             the steps are kept; 0 keeps all, as the paper does.
         spread_members: Whether the members of the ensemble start from situations that are sampled from the posterior,
@@ -143,6 +145,7 @@ class Hyperparameters:
     selection_size: int = 0
     adapt_lr: float | None = None
     adapt_embedding_lr: float | None = None
+    adapt_decay: float = 0.0
     validation_size: int = 0
     spread_members: bool = False
     forget_at_reset: bool = False
@@ -235,6 +238,7 @@ class Hyperparameters:
             own(self.adapt_lr, self.inner_lr),
             own(self.adapt_embedding_lr, self.embedding_lr),
             own(self.adapt_optimizer, self.inner_optimizer),
+            self.adapt_decay,
         )
 
     @property
@@ -267,7 +271,7 @@ class Hyperparameters:
 _ONLINE = {
     *("compose", "likelihood_power", "hazard", "adapt_every", "adapt_at_reset", "memory_size", "forget_at_reset"),
     *("adapt_optimizer", "adapt_steps", "adapt_epochs", "adapt_batch_size", "adapt_lr", "adapt_embedding_lr"),
-    *("keep_adapting", "selection_size"),
+    *("adapt_decay", "keep_adapting", "selection_size"),
     *("validation_size", "spread_members", "clamp_predictions", "planning_reward"),
     *("planner", "horizon", "candidates", "planner_iterations", "elites", "init_std", "noise_beta", "temperature"),
 }

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -130,6 +131,7 @@ def test_adaptation_inherits_what_is_not_said_otherwise() -> None:
     assert settings.adaptation(seen=100) == settings.inner_loop()
     own = Hyperparameters(adapt_steps=0, adapt_lr=0.0, adapt_embedding_lr=0.5).adaptation(seen=100)
     assert (own.steps, own.lr, own.embedding_lr) == (0, 0.0, 0.5)
+    assert Hyperparameters(adapt_decay=3.0).adaptation(seen=100) == replace(Hyperparameters().inner_loop(), decay=3.0)
 
 
 @given(st.integers(0, 5000), st.integers(1, 300), st.integers(1, 50))

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from famle_agent.dynamics import Batch, Dynamics, Theta, expand
-from famle_agent.inner_loop import InnerLoop
+from famle_agent.inner_loop import Anchor, InnerLoop
 
 OPTIMIZERS = ("sgd", "adam")
 
@@ -106,6 +106,36 @@ def test_each_step_draws_its_data() -> None:
     assert len(drawn) == 3
     for loss, data in zip(losses, drawn, strict=True):
         torch.testing.assert_close(loss, model.loss(*start(model, 1), data))
+
+
+@given(st.floats(0.0, 20.0), st.lists(st.integers(0, 30), min_size=2, max_size=2))
+def test_anchor_takes_a_step_back_by_a_part_of_the_way(decay: float, seen: list[int]) -> None:
+    model, data = fresh_model(), some_data(2)
+    theta, h = start(model, 2)
+    anchor = Anchor({name: value + 1.0 for name, value in theta.items()}, torch.tensor(seen))
+    free, h_free, _ = InnerLoop(1, 0.1, 0.2)(model, theta, h, lambda: data)
+    drawn, h_drawn, _ = InnerLoop(1, 0.1, 0.2, decay=decay)(model, theta, h, lambda: data, anchor)
+    assert torch.equal(h_drawn, h_free)
+    for i, n in enumerate(seen):
+        part = min(1.0, decay / max(n, 1))
+        for name, value in free.items():
+            torch.testing.assert_close(drawn[name][i], (1.0 - part) * value[i] + part * anchor.theta[name][i])
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_anchor_holds_the_more_the_less_was_seen(optimizer: str) -> None:
+    model, data = fresh_model(), some_data(1)
+    data = Batch(*(values.expand(4, *values.shape[1:]) for values in (data.x, data.y, data.weight)))
+    theta, h = start(model, 1)
+    theta, h = {name: value.expand(4, *value.shape[1:]) for name, value in theta.items()}, h.expand(4, -1)
+    anchor = Anchor(theta, torch.tensor([1.0, 10.0, 100.0, 1e9]))
+    far, *_ = InnerLoop(50, 0.01, 0.0, optimizer, decay=1.0)(model, theta, h, lambda: data, anchor)
+    way = sum((value - theta[name]).flatten(1).square().sum(dim=1) for name, value in far.items())
+    assert way[0] == 0.0
+    assert (way.diff() > 0.0).all()
+    free, *_ = InnerLoop(50, 0.01, 0.0, optimizer)(model, theta, h, lambda: data)
+    for name, value in free.items():
+        torch.testing.assert_close(far[name][3], value[3], rtol=1e-3, atol=1e-4)
 
 
 def test_gradients_are_found_where_they_are_switched_off() -> None:
