@@ -28,7 +28,7 @@ from benchmarks.harness import Options, Result
 from benchmarks.methods import METHODS, PPO_METHODS, Method, Task, famle, from_cache
 from benchmarks.reporting.report import show
 from famle_agent import FAMLE, FAMLEWrapper, ModelBasedAgent
-from famle_agent.hyperparameters import known_robots
+from famle_agent.robots import known_robots
 from famle_agent.walking import BrokenRun, run_and_break
 from famle_envs import Situation
 from famle_envs.ant import AntEnv

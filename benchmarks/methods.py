@@ -23,8 +23,8 @@ import famle_envs  # noqa: F401 (registers the robots)
 from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent, Transitions
 from famle_agent.checkpoint import load_pretrained
 from famle_agent.envs import situation_envs
-from famle_agent.hyperparameters import known_robots
 from famle_agent.policies import make_held_uniform
+from famle_agent.robots import known_robots
 from famle_agent.transitions import collect
 from famle_envs import Situation
 from famle_envs.wrappers import RandomSituation

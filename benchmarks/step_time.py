@@ -29,7 +29,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 import famle_envs  # noqa: F401 (registers the robots)
 from benchmarks.harness import Result, provenance, write_json
 from famle_agent import AMPC, AMPCMAML, FAMLE
-from famle_agent.hyperparameters import known_robots
+from famle_agent.robots import known_robots
 
 HARDLY: Mapping[str, Any] = {
     **{"rounds": 0, "joint_iterations": 1, "meta_iterations": 1, "transitions_per_situation": 200},

@@ -268,7 +268,7 @@ def descend(
     if inner_loop.steps == 0:
         return start
     seen, newest = memory.split(validation_size)
-    anchor = _theta_meta(model, seen) if inner_loop.decay else None
+    anchor = _anchor(model, seen) if inner_loop.decay else None
     theta, h, _ = inner_loop(model, start.theta, start.h, sample(model, seen), anchor)
     if validation_size:
         batch = whole_memory(model, newest)()
@@ -279,8 +279,8 @@ def descend(
     return adapted.where(adapted.is_finite(), start)  # steps that diverged are no steps
 
 
-def _theta_meta(model: Dynamics, memory: Memory) -> Anchor:
-    """What draws the networks of B robots back, (B * P, ...)."""
+def _anchor(model: Dynamics, memory: Memory) -> Anchor:
+    """What the networks of B robots are drawn back to: theta_meta, (B * P, ...)."""
     n = memory.weight.sum(dim=1)
     return Anchor(expand(model.parameters_by_name(), len(n)), n.repeat_interleave(model.members))
 

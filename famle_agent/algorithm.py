@@ -20,10 +20,11 @@ from torch import Tensor
 from famle_agent.dynamics import Dynamics
 from famle_agent.envs import check_spaces, env_attribute, env_id, env_spec, make_env, planning_reward
 from famle_agent.errors import NotLearnedError
-from famle_agent.hyperparameters import Hyperparameters, robot_of
+from famle_agent.hyperparameters import Hyperparameters
 from famle_agent.observation import DIMS, ObservationLayout
 from famle_agent.planning import RewardFn
 from famle_agent.reward import LearnedReward
+from famle_agent.robots import robot_of
 from famle_agent.units import ActionScale
 
 if TYPE_CHECKING:

@@ -20,9 +20,10 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from famle_agent.envs import env_attribute, make_env
-from famle_agent.hyperparameters import Hyperparameters, known_robots
+from famle_agent.hyperparameters import Hyperparameters
 from famle_agent.observation import DIMS
 from famle_agent.online import OnlineState
+from famle_agent.robots import known_robots
 
 if TYPE_CHECKING:
     from famle_agent.agent import ModelBasedAgent

@@ -18,8 +18,8 @@ from famle_agent.agent import ModelBasedAgent
 from famle_agent.contest import with_and_without_adaptation
 from famle_agent.dashboard import encode_gif, log_gif, log_posterior
 from famle_agent.famle import FAMLE
-from famle_agent.hyperparameters import known_robots
 from famle_agent.plots import plot_returns, side_by_side
+from famle_agent.robots import known_robots
 from famle_agent.wrapper import FAMLEWrapper
 
 __all__ = ["Episode", "run_demo", "run_episode"]

@@ -14,9 +14,9 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import VecEnv
 
-from famle_agent.hyperparameters import known_robots
 from famle_agent.planning import RewardFn
 from famle_agent.policies import reward_names
+from famle_agent.robots import known_robots
 from famle_agent.transitions import EnvSource
 from famle_envs.reality import Profile
 from famle_envs.situation import Situation

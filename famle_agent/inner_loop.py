@@ -72,7 +72,7 @@ class InnerLoop:
             theta: Stacked parameters to start from; not changed.
             h: Embeddings to start from, (B, embedding_dim); not changed.
             sample: Gives the data of each step.
-            anchor: What theta is drawn back to after each step.
+            anchor: What theta is drawn back to after each step; None leaves it free.
 
         Returns:
             theta~, h~ and the loss before each step, (k, B).

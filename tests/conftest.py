@@ -12,7 +12,7 @@ from hypothesis import settings
 
 import famle_envs  # noqa: F401 (registers the robots)
 from famle_agent import FAMLE, Transitions
-from famle_agent.hyperparameters import known_robots
+from famle_agent.robots import known_robots
 
 mpl.use("Agg")
 torch.set_num_threads(1)

@@ -143,6 +143,19 @@ def test_descent_is_drawn_back_to_what_was_meta_learned(
     assert 0.0 < way(0.5 * seen) < way(0.01 * seen) < way(0.0)
 
 
+def test_each_robot_is_drawn_back_as_far_as_it_has_seen() -> None:
+    torch.manual_seed(0)
+    model = Dynamics(2, 1, n_situations=1, embedding_dim=2, hidden=(6,), members=2)
+    start = prior(model, Candidates.of(model, compose=False), robots=2)
+    obs, action, next_obs, log_p = (torch.randn(2, 8, size) for size in (2, 1, 2, 1))
+    memory = Memory.full(obs, action, next_obs, log_p)
+    memory.weight[0, :6] = 0.0  # two transitions of eight
+    after = descend(model, start, memory, replace(INNER_LOOP, decay=2.0))
+    for name, value in start.theta.items():
+        assert torch.equal(after.theta[name][:2], value[:2])
+    assert all((after.theta["weight_0"][row] != start.theta["weight_0"][row]).any() for row in (2, 3))
+
+
 def test_descent_that_diverges_stays_where_it_was(
     model: Dynamics, candidates: Candidates, held_out: Transitions
 ) -> None:

@@ -18,7 +18,7 @@ from benchmarks.compare import compare
 from benchmarks.harness import Options, ReplicateError, Result, load_results
 from benchmarks.methods import METHODS, PPO_METHODS, MetaTrained, Method, Task
 from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent
-from famle_agent.hyperparameters import known_robots
+from famle_agent.robots import known_robots
 from famle_envs import Situation
 from famle_envs.reacher import ReacherEnv
 

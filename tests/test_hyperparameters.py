@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from famle_agent import AMPC, AMPCMAML, FAMLE, Hyperparameters
-from famle_agent.hyperparameters import known_robots, robot_of
 from famle_agent.inner_loop import InnerLoop
 from famle_agent.joint_training import JointTraining
 from famle_agent.maml import MAML
 from famle_agent.planning import ICEM, MPPI, RandomShooting
+from famle_agent.robots import known_robots, robot_of
 
 MODES = ("ours", "paper")
 every_robot = pytest.mark.parametrize("robot", list(known_robots()))

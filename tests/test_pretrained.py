@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from famle_agent import FAMLE, Transitions
-from famle_agent.hyperparameters import Robot, known_robots
+from famle_agent.robots import Robot, known_robots
 from tests.conftest import SMALL
 
 MakeEnv = Callable[..., gym.Env[Any, Any]]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from famle_agent import FAMLE, FAMLEWrapper
-from famle_agent.hyperparameters import known_robots
+from famle_agent.robots import known_robots
 from famle_agent.walking import run_and_break
 
 MakeEnv = Callable[..., gym.Env[Any, Any]]

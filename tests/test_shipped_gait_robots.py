@@ -7,8 +7,8 @@ import gymnasium as gym
 import pytest
 
 from famle_agent import FAMLE, FAMLEWrapper
-from famle_agent.hyperparameters import known_robots
 from famle_agent.journey import run_journey
+from famle_agent.robots import known_robots
 
 MakeEnv = Callable[..., gym.Env[Any, Any]]
 ROBOTS = {"quadruped": 20, "minitaur": 9}
