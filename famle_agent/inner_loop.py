@@ -76,7 +76,12 @@ class InnerLoop:
 
         Returns:
             theta~, h~ and the loss before each step, (k, B).
+
+        Raises:
+            ValueError: There is a decay and no anchor.
         """
+        if self.decay and anchor is None:
+            raise ValueError(f"A decay of {self.decay} has nothing to draw theta back to; give an anchor, or decay=0.")
         theta = {name: value.detach().clone().requires_grad_() for name, value in theta.items()}
         h = h.detach().clone().requires_grad_()
         groups = [{"params": list(theta.values()), "lr": self.lr}, {"params": [h], "lr": self.embedding_lr}]

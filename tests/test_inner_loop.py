@@ -138,6 +138,12 @@ def test_anchor_holds_the_more_the_less_was_seen(optimizer: str) -> None:
         torch.testing.assert_close(far[name][3], value[3], rtol=1e-3, atol=1e-4)
 
 
+def test_a_decay_without_an_anchor_is_refused() -> None:
+    model, data = fresh_model(), some_data(1)
+    with pytest.raises(ValueError, match="give an anchor"):
+        InnerLoop(1, 0.1, 0.1, decay=1.0)(model, *start(model, 1), lambda: data)
+
+
 def test_gradients_are_found_where_they_are_switched_off() -> None:
     model, data = fresh_model(), some_data(1)
     with torch.no_grad():
