@@ -9,10 +9,14 @@ import matplotlib as mpl
 import pytest
 import torch
 from hypothesis import settings
+from joblib import parallel_config
+from stable_baselines3 import PPO
 
 import famle_envs  # noqa: F401 (registers the robots)
+from benchmarks import methods
 from famle_agent import FAMLE, Transitions
 from famle_agent.robots import known_robots
+from tests.small_reacher import EPISODE, REDUCED
 
 mpl.use("Agg")
 torch.set_num_threads(1)
@@ -109,3 +113,24 @@ def tiny_budgets(monkeypatch: pytest.MonkeyPatch) -> None:
             for name, value in (tiny if robot.pretrained is None else QUICK).items():
                 monkeypatch.setitem(mode, name, value)
     monkeypatch.setattr(gym.spec("FamleReacher-v0"), "max_episode_steps", 6)
+
+
+@pytest.fixture
+def small_reacher(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Shrinks what the benchmark's agents for the reacher spend, and its episodes; all in this process."""
+    robot = known_robots()["reacher"]
+    for mode in (*robot.modes.values(), *robot.rivals.values()):
+        for name, value in REDUCED.items():
+            monkeypatch.setitem(mode, name, value)
+    monkeypatch.setitem(robot.modes["original"], "adapt_epochs", 1)
+    monkeypatch.setattr(methods, "PPO", lambda *args, **kwargs: PPO(*args, **{**kwargs, "n_steps": 8, "batch_size": 8}))
+    monkeypatch.setitem(methods.PPO_SIMULATED, "reacher", 16)  # type: ignore[arg-type]
+    monkeypatch.setattr(gym.spec("FamleReacher-v0"), "max_episode_steps", EPISODE)
+    with parallel_config("sequential"):
+        yield
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the tests of a file share what their small agents learn in simulation."""
+    return tmp_path_factory.mktemp("cache")
