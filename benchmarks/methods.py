@@ -6,6 +6,7 @@ A method is one entry of :data:`METHODS`; every benchmark takes its agents from 
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -217,14 +218,21 @@ class MetaTrained:
         return agent
 
     def learn(self, task: Task) -> ModelBasedAgent:
-        """The agent with the networks of all replicates, from the cache where it has been learnt before."""
+        """The agent with the networks of all replicates, from the cache where it has been learnt before.
+
+        Learning that is stopped goes on from a folder beside the cached file, if it is asked for again.
+        """
         members = {} if _is_shipped(task.robot) else {"members": self.networks}
         agent = self._new(task.robot, seed=0, **members)
-        return from_cache(agent, task.cache / f"{task.robot}-{self.name}.zip", partial(self._learn, task=task))
+        path = task.cache / f"{task.robot}-{self.name}.zip"
+        on_its_way = path.with_suffix("")
+        agent = from_cache(agent, path, partial(self._learn, task=task, folder=on_its_way))
+        shutil.rmtree(on_its_way, ignore_errors=True)
+        return agent
 
-    def _learn(self, agent: ModelBasedAgent, task: Task) -> None:
+    def _learn(self, agent: ModelBasedAgent, task: Task, folder: Path) -> None:
         data = _simulated_data(task) if self.mode == "ours" else None
-        agent.meta_learn(data, progress_bar=True, n_jobs=-1)
+        agent.meta_learn(data, progress_bar=True, n_jobs=-1, folder=folder)
 
     def _new(self, robot: str, seed: int, **more: Any) -> ModelBasedAgent:
         return self.cls(robot, self.mode, seed=seed, device="cpu", pretrained=False, **{**self.settings, **more})

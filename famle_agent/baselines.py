@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -14,6 +14,7 @@ from famle_agent.agent import ModelBasedAgent
 from famle_agent.dynamics import expand
 from famle_agent.memory import Memory
 from famle_agent.online import OnlineState
+from famle_agent.simulation import Round
 from famle_agent.transitions import Transitions
 
 __all__ = ["AMPC", "AMPCMAML"]
@@ -86,11 +87,9 @@ class AMPC(_OneModelAgent):
     def _method(self, overrides: Mapping[str, Any]) -> str:
         return "ampc"
 
-    def _learn_model(
-        self, transitions: Transitions, round_: int, last: bool, on_iteration: Callable[[dict[str, float]], bool]
-    ) -> None:
+    def _learn_model(self, transitions: Transitions, round_: Round) -> None:
         """A network with random weights."""
-        self._begin_model(transitions, round_)
+        self._begin_model(transitions, round_.number)
 
 
 class AMPCMAML(_OneModelAgent):
@@ -112,10 +111,9 @@ class AMPCMAML(_OneModelAgent):
     def _method(self, overrides: Mapping[str, Any]) -> str:
         return str(overrides.get("meta_learner", "reptile"))
 
-    def _learn_model(
-        self, transitions: Transitions, round_: int, last: bool, on_iteration: Callable[[dict[str, float]], bool]
-    ) -> None:
+    def _learn_model(self, transitions: Transitions, round_: Round) -> None:
         """Joint training in each round, and in the last one Reptile or MAML."""
         settings = self.hyperparameters
         learn = settings.reptile() if settings.meta_learner == "reptile" else settings.maml()
-        self._meta_train(transitions, round_, last and settings.meta_iterations > 0, learn, on_iteration)
+        meta_learns = round_.last and settings.meta_iterations > 0
+        self._meta_train(transitions, replace(round_, last=meta_learns), learn)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -24,6 +24,7 @@ from famle_agent.dashboard import log_embeddings
 from famle_agent.memory import Memory
 from famle_agent.online import OnlineState
 from famle_agent.planning import Model
+from famle_agent.simulation import Round
 from famle_agent.transitions import Transitions
 
 __all__ = ["FAMLE"]
@@ -53,12 +54,10 @@ class FAMLE(ModelBasedAgent):
             raise ValueError("FAMLE meta-learns with Reptile; a meta_learner is for AMPCMAML, which has no embeddings.")
         return ""
 
-    def _learn_model(
-        self, transitions: Transitions, round_: int, last: bool, on_iteration: Callable[[dict[str, float]], bool]
-    ) -> None:
+    def _learn_model(self, transitions: Transitions, round_: Round) -> None:
         """Joint training in each round, and in the last one Algorithm 1: Reptile on theta and H."""
-        model = self._meta_train(transitions, round_, last, self.hyperparameters.reptile(), on_iteration)
-        if last:
+        model = self._meta_train(transitions, round_, self.hyperparameters.reptile())
+        if round_.last:
             log_embeddings(self.logger, model.embeddings[0], self.situations, self.num_timesteps)
 
     def _candidates(self) -> Candidates:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 
 from famle_agent.dynamics import Batch, Dynamics
+from famle_agent.progress import Progress
 
 __all__ = ["JointTraining"]
 
@@ -40,6 +41,7 @@ class JointTraining:
         data: Batch,
         generator: torch.Generator,
         callback: Callable[[float], bool] = lambda _: True,
+        progress: Progress | None = None,
     ) -> bool:
         """Trains ``model`` in place, from where it is.
 
@@ -48,6 +50,7 @@ class JointTraining:
             data: Encoded transitions of the N situations.
             generator: Source of all the chance; the members of the ensemble see different minibatches.
             callback: Called after each step with the mean loss; returning False ends the training.
+            progress: Where a training that was stopped goes on from; None begins anew.
 
         Returns:
             Whether all steps were done.
@@ -61,7 +64,10 @@ class JointTraining:
             optimizer, lambda done: min(1.0, 2.0 * (1.0 - done / max(1, self.iterations)))
         )
         theta, member = dict(model.theta.items()), torch.arange(model.members, device=data.x.device)[:, None]
-        for _ in range(self.iterations):
+        left = (progress or Progress()).iterations(
+            self.iterations, generator, model=model, optimizer=optimizer, schedule=schedule
+        )
+        for _ in left:
             c, batch = self._sample(data, model.members, generator)
             loss = model.loss(theta, model.embeddings[member, model.embedding_index(c)], batch)
             optimizer.zero_grad()

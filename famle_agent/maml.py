@@ -16,6 +16,7 @@ from torch import Tensor
 from famle_agent.dynamics import Batch, Dynamics, Theta, expand
 from famle_agent.inner_loop import InnerLoop
 from famle_agent.meta_learning import MetaStep
+from famle_agent.progress import Progress
 
 __all__ = ["MAML"]
 
@@ -50,6 +51,7 @@ class MAML:
         inner_loop: InnerLoop,
         generator: torch.Generator,
         callback: Callable[[MetaStep], bool] = lambda _: True,
+        progress: Progress | None = None,
     ) -> None:
         """Runs MAML on ``model`` in place.
 
@@ -61,6 +63,7 @@ class MAML:
             generator: Source of all the chance.
             callback: Called after each iteration with the mean loss on the inner steps' own data before them, and on
                 the other data after them; returning False ends meta-learning.
+            progress: Where meta-learning that was stopped goes on from; None begins anew.
 
         Raises:
             ValueError: The model, the data or the update rule do not fit, or the parameters diverge.
@@ -70,7 +73,10 @@ class MAML:
         meta_batch_size = min(self.meta_batch_size, n_situations)
         optimizer = torch.optim.Adam(model.theta.parameters(), lr=self.meta_lr, foreach=True)
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda done: 1.0 - done / self.iterations)
-        for iteration in range(self.iterations):
+        left = (progress or Progress()).iterations(
+            self.iterations, generator, model=model, optimizer=optimizer, schedule=schedule
+        )
+        for iteration in left:
             drawn = torch.randperm(n_situations, generator=generator, device=generator.device)
             c = drawn[:meta_batch_size].to(data.x.device)
             support, query = self._sample(data, c.repeat_interleave(model.members), generator)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from famle_agent.dynamics import Batch, Dynamics, expand
 from famle_agent.inner_loop import InnerLoop
+from famle_agent.progress import Progress
 
 __all__ = ["MetaStep", "Reptile"]
 
@@ -58,6 +59,7 @@ class Reptile:
         inner_loop: InnerLoop,
         generator: torch.Generator,
         callback: Callable[[MetaStep], bool] = lambda _: True,
+        progress: Progress | None = None,
     ) -> None:
         """Runs Algorithm 1 on ``model`` in place.
 
@@ -68,6 +70,7 @@ class Reptile:
             inner_loop: U^k.
             generator: Source of all the chance.
             callback: Called after each iteration; returning False ends meta-learning.
+            progress: Where meta-learning that was stopped goes on from; None begins anew.
 
         Raises:
             ValueError: There are not as many situations in the data as embeddings in the model.
@@ -79,7 +82,7 @@ class Reptile:
                 f"The model has {model.n_situations} embeddings, the data {n_situations} situations; make them equal."
             )
         meta_batch_size = min(self.meta_batch_size, n_situations)
-        for iteration in range(self.iterations):
+        for iteration in (progress or Progress()).iterations(self.iterations, generator, model=model):
             # Sample situations c and start from theta and h_c (line 10).
             order = torch.randperm(n_situations, generator=generator, device=generator.device)
             c = order[:meta_batch_size].to(data.x.device)

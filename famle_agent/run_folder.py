@@ -11,7 +11,7 @@ __all__ = ["RunFolder"]
 
 
 class RunFolder:
-    """Where a run keeps the transitions of each situation and round, and the agent after each round.
+    """Where a run keeps all transitions, the agent after each round, and how far the learning of a round has got.
 
     Args:
         path: The folder; made where it does not exist.
@@ -52,3 +52,12 @@ class RunFolder:
     def has_model(self, round_: int) -> bool:
         """Whether that round is done."""
         return self.model(round_).exists()
+
+    def progress(self, round_: int, stage: str) -> Path:
+        """The file of how far a stage of a round's learning has got."""
+        return self._path / f"round-{round_}-{stage}.pt"
+
+    def forget_progress(self, round_: int) -> None:
+        """Removes these files, of a round that is done."""
+        for file in self._path.glob(f"round-{round_}-*.pt"):
+            file.unlink()

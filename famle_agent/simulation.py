@@ -6,7 +6,7 @@ import os
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +24,29 @@ from famle_agent.envs import EnvLike, SituationEnvs, situation_envs
 from famle_agent.maml import MAML
 from famle_agent.meta_learning import MetaStep, Reptile
 from famle_agent.policies import MakePolicy, make_held_uniform, make_planning, reward_names
+from famle_agent.progress import Progress
 from famle_agent.run_folder import RunFolder
 from famle_agent.transitions import Transitions, collect
 from famle_agent.units import ActionScale
 
-__all__ = ["SimulationLearner"]
+__all__ = ["Round", "SimulationLearner"]
+
+
+@dataclass(frozen=True)
+class Round:
+    """Learning from what has been simulated so far.
+
+    Attributes:
+        number: 0 begins with a new model, the others go on with the last one.
+        last: Whether Algorithm 1 comes after it.
+        on_iteration: Takes scalars to log, and says whether to go on.
+        progress: Where a stage of the learning, given its name, goes on from.
+    """
+
+    number: int
+    last: bool
+    on_iteration: Callable[[dict[str, float]], bool]
+    progress: Callable[[str], Progress]
 
 
 class SimulationLearner(ModelBasedAlgorithm):
@@ -39,14 +57,8 @@ class SimulationLearner(ModelBasedAlgorithm):
     """
 
     @abstractmethod
-    def _learn_model(
-        self, transitions: Transitions, round_: int, last: bool, on_iteration: Callable[[dict[str, float]], bool]
-    ) -> None:
-        """Learns :attr:`dynamics` from simulated transitions (actions in [-1, 1]).
-
-        Round 0 begins with a new model, the others go on with :attr:`dynamics`. ``on_iteration`` takes scalars to log
-        and says whether to go on.
-        """
+    def _learn_model(self, transitions: Transitions, round_: Round) -> None:
+        """Learns :attr:`dynamics` from simulated transitions (actions in [-1, 1])."""
 
     @abstractmethod
     def forget(self) -> None:
@@ -80,8 +92,8 @@ class SimulationLearner(ModelBasedAlgorithm):
             tb_log_name: Name of the run in TensorBoard; by default the class and ``_meta``.
             progress_bar: Whether to show progress bars.
             n_jobs: Processes that simulate, -1 for one a core. The result does not depend on it.
-            folder: Where transitions are stored as they come, and the model after each round. The same call goes on
-                where one that was stopped had got to.
+            folder: Where transitions are stored as they come, the model after each round, and once a minute how far
+                a round has got. The same call goes on where one that was stopped had got to.
 
         Returns:
             The agent.
@@ -116,17 +128,24 @@ class SimulationLearner(ModelBasedAlgorithm):
                 self._restore(run.model(round_))
                 self.num_timesteps = self.hyperparameters.iterations(round_, last=round_ == rounds)
                 continue
-            going_on = self._learn_round(transitions, round_, rounds, hooks, progress_bar)
+            going_on = self._learn_round(transitions, round_, rounds, hooks, progress_bar, run)
             if not going_on:
                 break
             if run is not None:
                 self.save(run.model(round_))
+                run.forget_progress(round_)
         hooks.on_training_end()
         self.num_timesteps = 0
         return self
 
     def _learn_round(
-        self, transitions: Transitions, round_: int, rounds: int, hooks: BaseCallback, progress_bar: bool
+        self,
+        transitions: Transitions,
+        round_: int,
+        rounds: int,
+        hooks: BaseCallback,
+        progress_bar: bool,
+        run: RunFolder | None,
     ) -> bool:
         """Learns the model, and the reward where it is not known; says whether no callback ended it."""
         settings, last, going_on = self.hyperparameters, round_ == rounds, True
@@ -141,10 +160,17 @@ class SimulationLearner(ModelBasedAlgorithm):
                 going_on = self._log_iteration(scalars, max(1, settings.iterations(rounds) // 200), hooks)
                 return going_on
 
+            def skipped(iterations: int) -> None:
+                self.num_timesteps += iterations
+                bar.update(iterations)
+
+            def progress(stage: str) -> Progress:
+                return Progress(None if run is None else run.progress(round_, stage), skipped)
+
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(self._draw_seed())  # initial weights come from torch's global generator
                 try:
-                    self._learn_model(transitions, round_, last, on_iteration)
+                    self._learn_model(transitions, Round(round_, last, on_iteration, progress))
                     self._learn_reward(transitions)
                 except BaseException:
                     self.dynamics = known  # half-learnt models are none
@@ -234,23 +260,19 @@ class SimulationLearner(ModelBasedAlgorithm):
         model = self._require_dynamics()
         return model, model.encode(obs, action, next_obs)
 
-    def _meta_train(
-        self,
-        transitions: Transitions,
-        round_: int,
-        last: bool,
-        learn: Reptile | MAML,
-        on_iteration: Callable[[dict[str, float]], bool],
-    ) -> Dynamics:
+    def _meta_train(self, transitions: Transitions, round_: Round, learn: Reptile | MAML) -> Dynamics:
         """Trains the model on all situations at once, and in the last round meta-learns from there."""
-        settings, (model, data) = self.hyperparameters, self._begin_model(transitions, round_)
+        settings, (model, data) = self.hyperparameters, self._begin_model(transitions, round_.number)
 
-        def log(step: MetaStep) -> bool:
-            return on_iteration({"meta/loss_before": step.loss_before, "meta/loss_after": step.loss_after})
+        def log_joint(loss: float) -> bool:
+            return round_.on_iteration({"meta/joint_loss": loss})
 
-        joint_training = settings.joint_training(round_)
-        finished = joint_training(model, data, self._generator, lambda loss: on_iteration({"meta/joint_loss": loss}))
-        if last and finished:
-            learn(model, data, settings.inner_loop(), self._generator, log)
+        def log_meta(step: MetaStep) -> bool:
+            return round_.on_iteration({"meta/loss_before": step.loss_before, "meta/loss_after": step.loss_after})
+
+        joint_training = settings.joint_training(round_.number)
+        finished = joint_training(model, data, self._generator, log_joint, round_.progress("joint"))
+        if round_.last and finished:
+            learn(model, data, settings.inner_loop(), self._generator, log_meta, round_.progress("meta"))
         model.fit_noise(data)
         return model

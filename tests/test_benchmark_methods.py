@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from benchmarks import curves, methods, reacher
 from benchmarks.methods import METHODS, PPO_METHODS, MetaTrained
-from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent
+from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent, simulation
+from famle_agent.progress import Progress
 from famle_agent.robots import known_robots
 from tests.small_reacher import EPISODE, REDUCED, task_of
 
@@ -172,6 +174,26 @@ def test_rivals_learn_from_the_same_transitions(monkeypatch: pytest.MonkeyPatch,
     assert given[0].digest() == given[1].digest()
     assert given[0].obs.shape == (11, REDUCED["transitions_per_situation"], 12)
     assert given[2] is None  # the paper's collects its own, without holding actions
+
+
+def test_stopped_meta_training_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(simulation, "Progress", partial(Progress, every=0.0))
+    recipe, task = MetaTrained("paper", FAMLE, "paper"), task_of(0, tmp_path / "stopped")
+    whole = recipe.learn(task_of(0, tmp_path / "whole"))
+    log, iterations = ModelBasedAgent._log_iteration, list[int]()
+
+    def log_iteration(self: ModelBasedAgent, *args: Any) -> bool:
+        iterations.append(self.num_timesteps)
+        if iterations == [0, 1]:
+            raise KeyboardInterrupt
+        return log(self, *args)
+
+    monkeypatch.setattr(ModelBasedAgent, "_log_iteration", log_iteration)
+    with pytest.raises(KeyboardInterrupt):
+        recipe.learn(task)
+    assert torch.equal(network_of(recipe.learn(task)), network_of(whole))
+    assert iterations == [0, 1, 1]
+    assert [path.name for path in task.cache.iterdir()] == ["reacher-paper.zip"]
 
 
 def test_replicates_share_one_network_where_one_is_shipped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from famle_agent import FAMLE, Transitions
+from famle_agent import FAMLE, Transitions, simulation
 from famle_agent.dynamics import Dynamics
+from famle_agent.progress import Progress
 
 SITUATIONS = ["intact", "joint 0 reversed", "joint 3 dead"]
 TINY: dict[str, Any] = {
@@ -198,22 +200,31 @@ def test_reward_that_is_learned_judges_the_plans_of_a_round() -> None:
 # --- a run that is stopped ----------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("every", [0.0, 60.0], ids=["saved each iteration", "saved after each stage"])
 @pytest.mark.parametrize("iteration", [2, 8, 12, 16], ids=["round 0", "round 1", "round 2", "Algorithm 1"])
 def test_interrupted_run_goes_on_to_the_same_agent(
-    make_agent: Make, uninterrupted: Dynamics, tmp_path: Path, iteration: int
+    make_agent: Make,
+    uninterrupted: Dynamics,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    iteration: int,
+    every: float,
 ) -> None:
+    monkeypatch.setattr(simulation, "Progress", partial(Progress, every=every))
     with pytest.raises(KeyboardInterrupt):
         make_agent().meta_learn(SITUATIONS, callback=interrupt_at(iteration), folder=tmp_path)
     rounds = sum(iteration > done for done in ITERATIONS)
     assert sorted(tmp_path.glob("*.zip")) == [tmp_path / f"round-{i}.zip" for i in range(rounds)]
-    files = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    files = {file: file.read_bytes() for file in [*tmp_path.rglob("*.zip"), *tmp_path.rglob("*.npz")]}
     steps: list[int] = []
     agent = make_agent()
     agent.meta_learn(
         SITUATIONS, callback=lambda local, _: steps.append(local["self"].num_timesteps) or True, folder=tmp_path
     )
     assert_same(agent.dynamics, uninterrupted)
-    assert steps == list(range([0, *ITERATIONS][rounds] + 1, ITERATIONS[-1] + 1))
+    saved = iteration - 1 if every == 0.0 else {2: 0, 8: 6, 12: 10, 16: 14}[iteration]
+    assert steps == list(range(saved + 1, ITERATIONS[-1] + 1))
+    assert not list(tmp_path.glob("*.pt"))  # of no use to a round that is done
     assert all(file.read_bytes() == content for file, content in files.items())  # nothing is done twice
     assert [data.obs.shape[1] for data in stored(tmp_path, 2)] == [12] * 3
 
