@@ -32,8 +32,9 @@ def run(
         agent: Acts on all the robots.
         tasks: The test robots; the seed of the first is the agent's.
         steps: Of each robot.
-        saved: The file of an agent's life, which goes on from there and is saved there; a PPO's is not.
-        save_every: Seconds between two savings at least; it waits for the end of an episode.
+        saved: The file of an agent's life, which goes on from there and is saved there.
+        save_every: Seconds between two savings at least. It waits for the end of an episode, or where an agent learns
+            from rollouts for the beginning of one: the episode that is going on then is not counted.
 
     Raises:
         ValueError: The steps do not suffice for one episode.
@@ -46,7 +47,7 @@ def run(
     agent.set_env(vec_env)
     agent.set_random_seed(tasks[0].seed)
     history = History([[] for _ in tasks], [[] for _ in tasks])
-    if saved is not None and isinstance(agent, ModelBasedAgent) and (earlier := read_life(saved, agent)) is not None:
+    if saved is not None and (earlier := read_life(saved, agent)) is not None:
         history = earlier
         for robot, state in zip(robots, history.random, strict=True):
             robot.begin_with(state)
@@ -58,7 +59,7 @@ def run(
 
 
 class _Historian(BaseCallback):
-    """Notes what robots go through, and saves it at the end of an episode of all of them."""
+    """Notes what robots go through, and saves it now and then."""
 
     def __init__(
         self, earlier: History, envs: Sequence[Monitor[Any, Any]], saved: Path | None, save_every: float
@@ -79,11 +80,17 @@ class _Historian(BaseCallback):
         return History(returns, lengths, seconds, [env.get_wrapper_attr("began_with") for env in self._envs])
 
     def _on_step(self) -> bool:
-        due = time.perf_counter() - self._saved_at >= self._save_every
-        if self._saved is not None and isinstance(self.model, ModelBasedAgent) and due and self.locals["dones"].all():
+        if isinstance(self.model, ModelBasedAgent) and self.locals["dones"].all():
+            self._save()
+        return True
+
+    def _on_rollout_start(self) -> None:
+        self._save()
+
+    def _save(self) -> None:
+        if self._saved is not None and time.perf_counter() - self._saved_at >= self._save_every:
             write_life(self._saved, self.model, self.history)
             self._saved_at = time.perf_counter()
-        return True
 
 
 def _result(task: Task, history: History, i: int, steps: int) -> Result:

@@ -1,4 +1,4 @@
-"""Lives that can go on after an interruption: agent, robots' random numbers and history at the end of an episode.
+"""Lives that can go on after an interruption: agent, robots' random numbers and history of whole episodes.
 
 What is stored belongs to the code that it lived with: another commit begins anew.
 """
@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from benchmarks.harness import commit, write_whole
 from famle_agent import ModelBasedAgent
@@ -71,7 +72,7 @@ class History:
         return min(sum(lengths) for lengths in self.lengths)
 
 
-def write_life(path: Path, agent: ModelBasedAgent, history: History) -> None:
+def write_life(path: Path, agent: BaseAlgorithm, history: History) -> None:
     """Writes a life, whole or not at all."""
     content, saved = io.BytesIO(), io.BytesIO()
     agent.save(saved)
@@ -82,8 +83,11 @@ def write_life(path: Path, agent: ModelBasedAgent, history: History) -> None:
     write_whole(path, content.getvalue())
 
 
-def read_life(path: Path, agent: ModelBasedAgent) -> History | None:
+def read_life(path: Path, agent: BaseAlgorithm) -> History | None:
     """Gives an agent what it had learnt, and says what it had gone through.
+
+    One of ours goes on as if nothing had happened. One of Stable-Baselines3 has its networks and its optimizer, and
+    goes on with other random numbers than it began with.
 
     Args:
         path: What :func:`write_life` wrote, or no file yet.
@@ -98,5 +102,10 @@ def read_life(path: Path, agent: ModelBasedAgent) -> History | None:
         lived_with = archive.read(_COMMIT).decode()
         if lived_with != commit() or lived_with == "unknown" or lived_with.endswith("-dirty"):
             return None
-        restore_agent(agent, io.BytesIO(archive.read(_AGENT)))
-        return History(**json.loads(archive.read(_HISTORY)))
+        saved, history = io.BytesIO(archive.read(_AGENT)), History(**json.loads(archive.read(_HISTORY)))
+    if isinstance(agent, ModelBasedAgent):
+        restore_agent(agent, saved)
+    else:
+        agent.set_parameters(saved, device=agent.device)  # type: ignore[arg-type]
+        agent.set_random_seed((agent.seed or 0) + history.steps)
+    return history

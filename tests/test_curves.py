@@ -2,8 +2,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
 from benchmarks import curves, lives, reacher
 from benchmarks.methods import METHODS
@@ -95,10 +97,32 @@ def test_life_of_other_code_begins_anew(
     assert lived == [2 * EPISODE]
 
 
-def test_ppo_is_not_saved_on_its_way(cache: Path, tmp_path: Path) -> None:
+def test_interrupted_ppo_goes_on_with_what_it_has_learnt(
+    cache: Path, tmp_path: Path, code: Callable[[str], None]
+) -> None:
+    """In rollouts of 8 steps, saved before each of them."""
+    code("1a2b3c4")
     task, life = task_of(0, cache), tmp_path / "life.zip"
-    curves.run(METHODS["ppo"].agent(task), [task], 2 * EPISODE, life, save_every=0.0)
-    assert not life.exists()
+    (one,) = curves.run(METHODS["ppo"].agent(task), [task], 5 * EPISODE, life, save_every=0.0)
+    assert one["lengths"] == [EPISODE] * 5
+    agent, fresh = METHODS["ppo"].agent(task), METHODS["ppo"].agent(task)
+    went_on_with: list[dict[str, torch.Tensor]] = []
+    learn, steps = agent.learn, list[int]()
+
+    def watch(total_timesteps: int, **kwargs: Any) -> Any:
+        went_on_with.append({name: value.clone() for name, value in agent.policy.state_dict().items()})
+        steps.append(total_timesteps)
+        return learn(total_timesteps, **kwargs)
+
+    agent.learn = watch  # type: ignore[method-assign]
+    (other,) = curves.run(agent, [task], 9 * EPISODE, life, save_every=0.0)
+    assert steps == [5 * EPISODE]  # four episodes had ended when the last of four rollouts began
+    assert other["lengths"] == [EPISODE] * 9
+    assert other["returns"][:4] == one["returns"][:4]
+    weights = fresh.policy.state_dict()
+    assert any(not torch.equal(value, weights[name]) for name, value in went_on_with[0].items())
+    (whole,) = curves.run(fresh, [task], 9 * EPISODE)
+    assert whole["returns"][:4] == one["returns"][:4]
 
 
 def test_life_is_saved_now_and_then(cache: Path, tmp_path: Path) -> None:
