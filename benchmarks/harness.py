@@ -18,6 +18,7 @@ from joblib import delayed
 from tqdm import tqdm
 
 from famle_agent.cluster import Backend, as_completed, parallel
+from famle_agent.whole_file import whole_file
 
 __all__ = [
     "Fleet",
@@ -180,9 +181,8 @@ def write_json(path: Path, value: Any) -> None:
 def write_whole(path: Path, content: bytes) -> None:
     """Writes a file that is either whole or not there; an older one stays until the new one is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.partial")
-    partial.write_bytes(content)
-    partial.replace(path)
+    with whole_file(path) as partial:
+        partial.write_bytes(content)
 
 
 def _path(folder: Path, method: str, seed: int) -> Path:

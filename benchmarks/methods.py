@@ -5,7 +5,6 @@ A method is one entry of :data:`METHODS`; every benchmark takes its agents from 
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,6 +26,7 @@ from famle_agent.envs import situation_envs
 from famle_agent.policies import make_held_uniform
 from famle_agent.robots import known_robots
 from famle_agent.transitions import collect
+from famle_agent.whole_file import whole_file
 from famle_envs import Situation
 from famle_envs.wrappers import RandomSituation
 
@@ -287,9 +287,9 @@ def _learn_ppo(task: Task) -> Path:
         env = make_vec_env(lambda: RandomSituation(gym.make(task.env_id)), n_envs=8, seed=0)
         agent = PPO("MlpPolicy", env, n_steps=256, batch_size=256, seed=0, device="cpu")
         agent.learn(PPO_SIMULATED[task.robot], progress_bar=True)
-        partial_path = path.with_name(f"{path.stem}.{os.getpid()}.partial.zip")
-        agent.save(partial_path)
-        partial_path.replace(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path) as partial_path, partial_path.open("wb") as file:
+            agent.save(file)
         env.close()
     return path
 

@@ -115,5 +115,4 @@ class AMPCMAML(_OneModelAgent):
         """Joint training in each round, and in the last one Reptile or MAML."""
         settings = self.hyperparameters
         learn = settings.reptile() if settings.meta_learner == "reptile" else settings.maml()
-        meta_learns = round_.last and settings.meta_iterations > 0
-        self._meta_train(transitions, replace(round_, last=meta_learns), learn)
+        self._meta_train(transitions, round_, learn)

@@ -24,6 +24,7 @@ from famle_agent.hyperparameters import Hyperparameters
 from famle_agent.observation import DIMS
 from famle_agent.online import OnlineState
 from famle_agent.robots import known_robots
+from famle_agent.whole_file import whole_file
 
 if TYPE_CHECKING:
     from famle_agent.agent import ModelBasedAgent
@@ -63,12 +64,8 @@ def write_checkpoint(file: File, meta: dict[str, Any], tensors: dict[str, Tensor
         return
     path = _with_suffix(file)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
+    with whole_file(path) as partial:
         partial.write_bytes(_pack(meta, tensors))
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def read_checkpoint(file: File) -> tuple[dict[str, Any], dict[str, Tensor]]:

@@ -11,6 +11,8 @@ from typing import Any, Protocol
 
 import torch
 
+from famle_agent.whole_file import whole_file
+
 __all__ = ["Progress", "Stateful"]
 
 
@@ -78,6 +80,5 @@ class Progress:
         if self._file is None:
             return
         states = {name: part.state_dict() for name, part in parts.items()}
-        partial = self._file.with_name(f"{self._file.name}.partial")
-        torch.save({"done": done, "generator": generator.get_state(), **states}, partial)
-        partial.replace(self._file)
+        with whole_file(self._file) as file:
+            torch.save({"done": done, "generator": generator.get_state(), **states}, file)

@@ -7,6 +7,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+from famle_agent.whole_file import whole_file
+
 __all__ = ["RunFolder"]
 
 
@@ -26,9 +28,8 @@ class RunFolder:
         self._path.mkdir(parents=True, exist_ok=True)
         file, wanted = self._path / "run.json", json.loads(json.dumps(fingerprint))
         if not file.exists():
-            partial = file.with_suffix(".partial")
-            partial.write_text(json.dumps(wanted, indent=1) + "\n")
-            partial.replace(file)
+            with whole_file(file) as partial:
+                partial.write_text(json.dumps(wanted, indent=1) + "\n")
             return
         try:
             found = json.loads(file.read_text())

@@ -272,7 +272,7 @@ class SimulationLearner(ModelBasedAlgorithm):
 
         joint_training = settings.joint_training(round_.number)
         finished = joint_training(model, data, self._generator, log_joint, round_.progress("joint"))
-        if round_.last and finished:
+        if round_.last and settings.meta_iterations and finished:
             learn(model, data, settings.inner_loop(), self._generator, log_meta, round_.progress("meta"))
         model.fit_noise(data)
         return model

@@ -19,6 +19,7 @@ from joblib import delayed
 
 from famle_agent.cluster import as_completed
 from famle_agent.policies import MakePolicy
+from famle_agent.whole_file import whole_file
 
 __all__ = ["EnvSource", "Transitions", "collect"]
 
@@ -82,15 +83,9 @@ class Transitions:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a compressed NumPy archive; an older file stays whole until the new one is complete."""
-        target = Path(path)
-        partial = target.with_name(target.name + ".partial")
         arrays = {name: getattr(self, name) for name in ("obs", "action", "reward", "next_obs")}
-        try:
-            with partial.open("wb") as file:
-                np.savez_compressed(file, **arrays, situations=np.array(self.situations))
-            partial.replace(target)
-        finally:
-            partial.unlink(missing_ok=True)
+        with whole_file(Path(path)) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, **arrays, situations=np.array(self.situations))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Transitions:

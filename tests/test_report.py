@@ -164,6 +164,9 @@ def test_curves_are_compared_over_the_steps_that_all_have_and_long_budgets_are_t
     assert (rows["ppo"]["solved_in_common_steps"], rows["ppo"]["solved"]) == ("0", "2")
     assert (rows["ppo"]["robot_steps"], rows["famle"]["robot_steps"]) == ("1000", "200")
     assert float(rows["ppo"]["solved_at"]) == 550.0
+    assert float(rows["ppo"]["famle_matched_at"]) == 550.0  # the first above 35
+    assert (rows["famle"]["famle_matched_at"], rows["oracle"]["famle_matched_at"]) == ("", "50.0")
+    assert (float(rows["ppo"]["end_median"]), float(rows["famle"]["end_median"])) == (50.0, 35.0)
     assert float(rows["ppo"]["famle_faster_by"]) == pytest.approx(550.0 / 75.0 - 1.0, abs=1e-4)
     assert "mean return over 200 robot steps" in text
     assert "200 robot steps instead of 1,000" in text

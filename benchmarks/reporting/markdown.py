@@ -83,8 +83,9 @@ them.""",
 _NOTES: Mapping[Kind, str] = {
     "curves": """Solved: three returns in a row above {study.experiment.threshold:g}, counted at the end of the first of
 them; a replicate that never gets there is infinite in the median. Methods are compared over the first {study.steps:,}
-robot steps, but for those of which the title says that they have fewer; *solved at* and *first crossing* are over all
-steps of a method. The time of a step contains the simulated robot and all learning on the way.""",
+robot steps, but for those of which the title says that they have fewer; *solved at*, *first crossing*, *matches FAMLE*
+(its first episode above FAMLE's median one at the end of these steps) and *its last* episode are over all steps of a
+method. The time of a step contains the simulated robot and all learning on the way.""",
     "episode": """A robot walks again as soon as its mean speed over 100 steps is above 0.8 m/s, the paper's solved
 mark; the steps since the damage are a median, in which one that never does is infinite. The time is the median of a
 control step, with adaptation.""",
@@ -110,7 +111,9 @@ def _curves(study: Study) -> list[Column]:
         ("solved at", lambda row: _steps(row.get("solved_at"))),
         ("first crossing", lambda row: _steps(row.get("first_crossing"))),
         ("FAMLE faster by", lambda row: _percent(row.get("famle_faster_by"))),
+        ("matches FAMLE", lambda row: _steps(row.get("famle_matched_at"))),
         ("2nd episode", lambda row: _number(row.get("second_episode_median"))),
+        ("its last", lambda row: _spread(row, "end")),
         *_times(study),
     ]
 

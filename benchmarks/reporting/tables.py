@@ -121,8 +121,10 @@ def _curves(study: Study, method: str) -> Row:
         "solved": sum(step is not None for step in solved),
         "solved_at": median_steps(solved),
         "famle_faster_by": _famle_faster_by(study, runs),
-        "first_crossing": median_steps([first_crossing(run["returns"], run["lengths"], threshold) for run in runs]),
+        "first_crossing": _crossed_at(runs, threshold),
+        "famle_matched_at": _famle_matched_at(study, runs),
     }
+    row["end_low"], row["end_median"], row["end_high"] = quartiles([run["returns"][-1] for run in runs])
     if study.lived[method] >= study.steps:
         row["solved_in_common_steps"] = sum(solved_at(*run, threshold) is not None for run in early)
     return row
@@ -184,6 +186,18 @@ def _famle_faster_by(study: Study, runs: Sequence[Result]) -> float | None:
         return None
     famle, other = (median_steps(_solved_at(study, some)) for some in (subject, runs))
     return other / famle - 1.0 if np.isfinite(famle) else None
+
+
+def _famle_matched_at(study: Study, runs: Sequence[Result]) -> float | None:
+    """When a method has its first episode above FAMLE's median one at the end of the steps that all have."""
+    *_, last = study.measures
+    if SUBJECT not in study.runs or runs is study.runs[SUBJECT] or not study.has(SUBJECT, last):
+        return None
+    return _crossed_at(runs, float(np.median(study.scores(SUBJECT, last))))
+
+
+def _crossed_at(runs: Sequence[Result], threshold: float) -> float:
+    return median_steps([first_crossing(run["returns"], run["lengths"], threshold) for run in runs])
 
 
 def _published(study: Study, method: str) -> Row:
