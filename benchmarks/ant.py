@@ -25,8 +25,9 @@ import tyro
 from benchmarks import curves
 from benchmarks.compare import compare
 from benchmarks.harness import Options, Result
-from benchmarks.methods import METHODS, PPO_METHODS, Method, Task, famle, from_cache
+from benchmarks.methods import METHODS, PPO_METHODS, Method, famle, from_cache
 from benchmarks.reporting.report import show
+from benchmarks.task import Task
 from famle_agent import FAMLE, FAMLEWrapper, ModelBasedAgent
 from famle_agent.robots import known_robots
 from famle_agent.walking import BrokenRun, run_and_break

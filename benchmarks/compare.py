@@ -7,7 +7,8 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks.harness import Fleet, Options, Replicate, ReplicateError, Result, is_stored, run_replicates
-from benchmarks.methods import METHODS, Method, Task
+from benchmarks.methods import METHODS, Method
+from benchmarks.task import Task
 from famle_agent.cluster import parallel
 
 __all__ = ["compare"]

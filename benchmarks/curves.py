@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from benchmarks.harness import Result
 from benchmarks.lives import History, Repeatable, read_life, write_life
-from benchmarks.methods import Task
+from benchmarks.task import Task
 from famle_agent import ModelBasedAgent
 
 __all__ = ["run"]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.harness import Result
-from benchmarks.methods import METHODS, Task
+from benchmarks.methods import METHODS
+from benchmarks.task import Task
 from famle_agent import FAMLEWrapper, ModelBasedAgent
 from famle_agent.journey import run_journey
 

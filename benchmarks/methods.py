@@ -12,60 +12,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import gymnasium as gym
 import torch
-from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.monitor import Monitor
 
-import famle_envs  # noqa: F401 (registers the robots)
+from benchmarks import ppo
+from benchmarks.task import Task
 from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent, Transitions
 from famle_agent.checkpoint import load_pretrained
 from famle_agent.envs import situation_envs
 from famle_agent.policies import make_held_uniform
 from famle_agent.robots import known_robots
 from famle_agent.transitions import collect
-from famle_agent.whole_file import whole_file
-from famle_envs import Situation
-from famle_envs.wrappers import RandomSituation
 
-__all__ = ["METHODS", "PPO_METHODS", "Method", "Task", "famle", "from_cache", "shipped"]
+__all__ = ["METHODS", "PPO_METHODS", "Method", "famle", "from_cache", "shipped"]
 
 Agent = TypeVar("Agent", bound=ModelBasedAgent)
-
-
-@dataclass(frozen=True)
-class Task:
-    """The test robot of one replicate.
-
-    Attributes:
-        robot: The robot's name.
-        seed: Of the robot and the planner, and of what the method learns for itself.
-        situation: What is wrong with the robot.
-        cache: Folder of the agents that are learnt in simulation, which replicates and methods share.
-        profile: What else differs from the simulator.
-        later: What goes wrong on the way, if anything does.
-        strikes_at: The action before which it does.
-    """
-
-    robot: str
-    seed: int
-    situation: Situation
-    cache: Path
-    profile: str = ""
-    later: Situation | None = None
-    strikes_at: int = 0
-
-    @property
-    def env_id(self) -> str:
-        """The Gymnasium id."""
-        return known_robots()[self.robot].env_id
-
-    def make(self) -> gym.Env[Any, Any]:
-        """The test robot."""
-        kwargs: dict[str, Any] = {"profile": self.profile} if self.profile else {}
-        return gym.make(self.env_id, situation=self.situation, **kwargs)
 
 
 @dataclass(frozen=True)
@@ -257,43 +218,6 @@ def _simulated_data(task: Task) -> Transitions:
     return Transitions.load(path)
 
 
-# --- PPO --------------------------------------------------------------------------------------------------------------
-
-PPO_SETTINGS: Mapping[str, Mapping[str, Any]] = {
-    # 100 steps between updates instead of 2,048, or it would not learn at all in the steps the others need.
-    "reacher": {"n_steps": 100, "batch_size": 50},
-}
-"""What differs from Stable-Baselines3's own defaults, by robot."""
-
-PPO_SIMULATED = {"reacher": 500_000, "ant": 2_000_000}
-"""Simulated steps of the PPO that is trained over the training situations first; FAMLE has 22,000 and 300,000."""
-
-
-def ppo(task: Task) -> PPO:
-    """Stable-Baselines3's PPO, which learns on the broken robot from scratch."""
-    return PPO("MlpPolicy", Monitor(task.make()), seed=task.seed, device="cpu", **PPO_SETTINGS.get(task.robot, {}))
-
-
-def ppo_pretrained(task: Task) -> PPO:
-    """The same, first trained in simulation with a training situation drawn for each episode."""
-    scratch = ppo(task)
-    scratch.set_parameters(str(_learn_ppo(task)), device="cpu")
-    return scratch
-
-
-def _learn_ppo(task: Task) -> Path:
-    path = task.cache / f"{task.robot}-ppo.zip"
-    if not path.exists():
-        env = make_vec_env(lambda: RandomSituation(gym.make(task.env_id)), n_envs=8, seed=0)
-        agent = PPO("MlpPolicy", env, n_steps=256, batch_size=256, seed=0, device="cpu")
-        agent.learn(PPO_SIMULATED[task.robot], progress_bar=True)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as partial_path, partial_path.open("wb") as file:
-            agent.save(file)
-        env.close()
-    return path
-
-
 # --- what they are called ---------------------------------------------------------------------------------------------
 
 
@@ -322,8 +246,8 @@ METHODS: dict[str, Method] = {
     "ampc-reptile": _meta_trained("reptile", AMPCMAML, in_step=True, meta_learner="reptile"),
     "ampc-fomaml": _meta_trained("fomaml", AMPCMAML, in_step=True, meta_learner="first-order-maml"),
     "ampc-maml": _meta_trained("maml", AMPCMAML, in_step=True, meta_learner="maml"),
-    "ppo": Method(ppo),
-    "ppo-pretrained": Method(ppo_pretrained, _learn_ppo),
+    "ppo": Method(ppo.from_scratch),
+    "ppo-pretrained": Method(ppo.simulated_first, ppo.learn_simulated),
     "oracle": Method(oracle),
     "one-simulator": Method(one_simulator, one_simulator),
 }

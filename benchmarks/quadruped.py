@@ -18,8 +18,8 @@ import tyro
 from benchmarks.compare import compare
 from benchmarks.gait_robots import run
 from benchmarks.harness import Options, load_results
-from benchmarks.methods import Task
 from benchmarks.reporting.report import show
+from benchmarks.task import Task
 from famle_agent.plots import plot_paths
 from famle_envs import Situation
 from famle_envs.quadruped import LEGS, REALITY, blocked_leg

@@ -17,8 +17,9 @@ import tyro
 from benchmarks import curves
 from benchmarks.compare import compare
 from benchmarks.harness import Options, Result
-from benchmarks.methods import METHODS, PPO_METHODS, Task
+from benchmarks.methods import METHODS, PPO_METHODS
 from benchmarks.reporting.report import show
+from benchmarks.task import Task
 from famle_envs import Situation
 from famle_envs.reacher import ReacherEnv
 

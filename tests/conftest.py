@@ -10,13 +10,12 @@ import pytest
 import torch
 from hypothesis import settings
 from joblib import parallel_config
-from stable_baselines3 import PPO
 
 import famle_envs  # noqa: F401 (registers the robots)
-from benchmarks import methods
+from benchmarks import ppo
 from famle_agent import FAMLE, Transitions
 from famle_agent.robots import known_robots
-from tests.small_reacher import EPISODE, REDUCED
+from tests.small_reacher import EPISODE, REDUCED, SMALL_ROLLOUTS
 
 mpl.use("Agg")
 torch.set_num_threads(1)
@@ -123,8 +122,9 @@ def small_reacher(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         for name, value in REDUCED.items():
             monkeypatch.setitem(mode, name, value)
     monkeypatch.setitem(robot.modes["original"], "adapt_epochs", 1)
-    monkeypatch.setattr(methods, "PPO", lambda *args, **kwargs: PPO(*args, **{**kwargs, "n_steps": 8, "batch_size": 8}))
-    monkeypatch.setitem(methods.PPO_SIMULATED, "reacher", 16)  # type: ignore[arg-type]
+    monkeypatch.setitem(ppo.SETTINGS, "reacher", SMALL_ROLLOUTS)  # type: ignore[arg-type]
+    monkeypatch.setattr(ppo, "SIMULATED_SETTINGS", SMALL_ROLLOUTS)
+    monkeypatch.setitem(ppo.SIMULATED_STEPS, "reacher", 16)  # type: ignore[arg-type]
     monkeypatch.setattr(gym.spec("FamleReacher-v0"), "max_episode_steps", EPISODE)
     with parallel_config("sequential"):
         yield

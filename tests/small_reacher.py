@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from benchmarks.methods import Task
+from benchmarks.task import Task
 from famle_envs import Situation
 from famle_envs.reacher import ReacherEnv
 
@@ -23,6 +23,7 @@ REDUCED: dict[str, Any] = {
     "horizon": 2,
     "candidates": 6,
 }
+SMALL_ROLLOUTS: dict[str, Any] = {"n_steps": 8, "batch_size": 8}
 
 
 def task_of(seed: int, cache: Path, situation: Situation = ReacherEnv.presets["paper"]) -> Task:

@@ -10,9 +10,9 @@ import torch
 from benchmarks.ant import ANT_METHODS, BIN, Args, damage_of, run, untrained
 from benchmarks.ant_model import accuracy
 from benchmarks.harness import Replicate, load_results, run_replicates
-from benchmarks.methods import Task
 from benchmarks.reporting.looks import look
 from benchmarks.reporting.report import show
+from benchmarks.task import Task
 from famle_agent.adaptation import Candidates
 from famle_envs.ant import AntEnv
 from tests.helpers import simple_model

@@ -9,7 +9,8 @@ import pytest
 
 from benchmarks.compare import compare
 from benchmarks.harness import Options, ReplicateError, Result, load_results
-from benchmarks.methods import Method, Task
+from benchmarks.methods import Method
+from benchmarks.task import Task
 from tests.small_reacher import task_of
 
 

@@ -10,9 +10,10 @@ import pytest
 from benchmarks import minitaur, quadruped
 from benchmarks.gait_robots import run
 from benchmarks.harness import Replicate, load_results, run_replicates
-from benchmarks.methods import METHODS, Task
+from benchmarks.methods import METHODS
 from benchmarks.reporting.looks import look
 from benchmarks.reporting.report import show
+from benchmarks.task import Task
 from famle_envs import Situation
 from famle_envs.quadruped import QuadrupedEnv
 
