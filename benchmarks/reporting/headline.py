@@ -30,7 +30,7 @@ def _median(row: Row) -> str:
 
 
 def _solved(row: Row) -> str:
-    return "never" if np.isinf(row["solved_at"]) else f"{row['solved_at']:,.0f}"
+    return f"not in {row['robot_steps']:,}" if np.isinf(row["solved_at"]) else f"{row['solved_at']:,.0f}"
 
 
 def _gaits(row: Row) -> str:
