@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +17,17 @@ class RunFolder:
     """Where a run keeps all transitions, the agent after each round, and how far the learning of a round has got.
 
     Args:
-        path: The folder; made where it does not exist.
+        path: The folder; made where it does not exist. None keeps nothing.
         fingerprint: What a run must have in common with the one that began the folder, as JSON types.
 
     Raises:
         ValueError: The folder is of another run.
     """
 
-    def __init__(self, path: str | os.PathLike[str], fingerprint: dict[str, Any]) -> None:
-        self._path = Path(path)
+    def __init__(self, path: str | os.PathLike[str] | None, fingerprint: dict[str, Any]) -> None:
+        self._path = None if path is None else Path(path)
+        if self._path is None:
+            return
         self._path.mkdir(parents=True, exist_ok=True)
         file, wanted = self._path / "run.json", json.loads(json.dumps(fingerprint))
         if not file.exists():
@@ -42,23 +45,26 @@ class RunFolder:
                 "one, or go on with the settings in its run.json."
             )
 
-    def transitions(self, round_: int) -> Path:
+    def transitions(self, round_: int) -> Path | None:
         """The folder of a round's transitions."""
-        return self._path / f"round-{round_}"
+        return self._path and self._path / f"round-{round_}"
 
-    def model(self, round_: int) -> Path:
-        """The file of the agent after a round."""
-        return self._path / f"round-{round_}.zip"
-
-    def has_model(self, round_: int) -> bool:
-        """Whether that round is done."""
-        return self.model(round_).exists()
-
-    def progress(self, round_: int, stage: str) -> Path:
+    def progress(self, round_: int, stage: str) -> Path | None:
         """The file of how far a stage of a round's learning has got."""
-        return self._path / f"round-{round_}-{stage}.pt"
+        return self._path and self._path / f"round-{round_}-{stage}.pt"
 
-    def forget_progress(self, round_: int) -> None:
-        """Removes these files, of a round that is done."""
-        for file in self._path.glob(f"round-{round_}-*.pt"):
-            file.unlink()
+    def finished(self, round_: int) -> Path | None:
+        """The file of the agent after a round, where that is done."""
+        file = self._model(round_)
+        return file if file is not None and file.exists() else None
+
+    def finish(self, round_: int, save: Callable[[Path], object]) -> None:
+        """Stores the agent after a round, and no longer how far that had got."""
+        file = self._model(round_)
+        if file is not None:
+            save(file)
+            for progress in file.parent.glob(f"round-{round_}-*.pt"):
+                progress.unlink()
+
+    def _model(self, round_: int) -> Path | None:
+        return self._path and self._path / f"round-{round_}.zip"

@@ -49,6 +49,28 @@ class Round:
     progress: Callable[[str], Progress]
 
 
+@dataclass(frozen=True)
+class _Call:
+    """What all rounds of one call of :meth:`SimulationLearner.meta_learn` have in common.
+
+    Attributes:
+        rounds: The number of the last one.
+        folder: Where it can go on from.
+        n_jobs: Processes that simulate.
+        progress_bar: Whether to show progress bars.
+    """
+
+    rounds: int
+    folder: RunFolder
+    n_jobs: int
+    progress_bar: bool
+
+    def bar(self, name: str, number: int, total: int, unit: str) -> tqdm[Any]:
+        """The progress bar of a round."""
+        desc = f"{name} {number + 1}/{self.rounds + 1}" if self.rounds else name
+        return tqdm(total=total, desc=desc, unit=unit, mininterval=1.0, disable=not self.progress_bar)
+
+
 class SimulationLearner(ModelBasedAlgorithm):
     """The part of an agent that learns its model in simulation.
 
@@ -104,7 +126,7 @@ class SimulationLearner(ModelBasedAlgorithm):
         """
         source = envs if isinstance(envs, Transitions) else situation_envs(self._require_env(), envs)
         rounds = 0 if isinstance(source, Transitions) else self.hyperparameters.rounds
-        run = None if folder is None else RunFolder(folder, self._fingerprint(source))
+        run = RunFolder(folder, self._fingerprint(source))
         if not self._custom_logger:
             name = tb_log_name or f"{type(self).__name__}_meta"
             self._logger = configure_logger(self.verbose, self.tensorboard_log, name)
@@ -112,52 +134,43 @@ class SimulationLearner(ModelBasedAlgorithm):
         total_timesteps = self.hyperparameters.iterations(rounds)  # the name that callbacks look for
         self.num_timesteps = 0
         self.forget()
-        if run is not None and self.seed is not None:
+        if folder is not None and self.seed is not None:
             self._generator.manual_seed(self.seed)  # the same call draws the same numbers, be it the first or not
         hooks.on_training_start(locals(), globals())
-        transitions, going_on = None, True
-        for round_ in range(rounds + 1):
-            store = None if run is None else run.transitions(round_)
-            if isinstance(source, Transitions):
-                new = self._in_model_units(source)
-            else:
-                new = self._in_model_units(self._collect(source, round_, progress_bar, n_jobs, store))
-            transitions = new if transitions is None else transitions.followed_by(new)
-            self.situations = transitions.situations
-            if run is not None and run.has_model(round_):
-                self._restore(run.model(round_))
-                self.num_timesteps = self.hyperparameters.iterations(round_, last=round_ == rounds)
-                continue
-            going_on = self._learn_round(transitions, round_, rounds, hooks, progress_bar, run)
-            if not going_on:
-                break
-            if run is not None:
-                self.save(run.model(round_))
-                run.forget_progress(round_)
+        self._go_round(source, _Call(rounds, run, n_jobs, progress_bar), hooks)
         hooks.on_training_end()
         self.num_timesteps = 0
         return self
 
-    def _learn_round(
-        self,
-        transitions: Transitions,
-        round_: int,
-        rounds: int,
-        hooks: BaseCallback,
-        progress_bar: bool,
-        run: RunFolder | None,
-    ) -> bool:
+    def _go_round(self, source: SituationEnvs | Transitions, call: _Call, hooks: BaseCallback) -> None:
+        """Simulates and learns, round by round, until a callback ends it."""
+        transitions = None
+        for number in range(call.rounds + 1):
+            new = self._in_model_units(
+                source if isinstance(source, Transitions) else self._simulate(source, number, call)
+            )
+            transitions = new if transitions is None else transitions.followed_by(new)
+            self.situations = transitions.situations
+            if (agent := call.folder.finished(number)) is not None:
+                self._restore(agent)
+                self.num_timesteps = self.hyperparameters.iterations(number, last=number == call.rounds)
+                continue
+            if not self._learn_round(transitions, number, call, hooks):
+                break
+            call.folder.finish(number, self.save)
+
+    def _learn_round(self, transitions: Transitions, number: int, call: _Call, hooks: BaseCallback) -> bool:
         """Learns the model, and the reward where it is not known; says whether no callback ended it."""
-        settings, last, going_on = self.hyperparameters, round_ == rounds, True
-        total, before, known = settings.iterations(round_, last), self.num_timesteps, self.dynamics
-        name = "Meta-learning" + (f" {round_ + 1}/{rounds + 1}" if rounds else "")
-        with tqdm(total=total - before, desc=name, mininterval=1.0, disable=not progress_bar) as bar:
+        settings, last, going_on = self.hyperparameters, number == call.rounds, True
+        log_interval = max(1, settings.iterations(call.rounds) // 200)
+        left, known = settings.iterations(number, last) - self.num_timesteps, self.dynamics
+        with call.bar("Meta-learning", number, left, "it") as bar:
 
             def on_iteration(scalars: dict[str, float]) -> bool:
                 nonlocal going_on
                 bar.set_postfix({key.split("/")[-1]: f"{value:.3g}" for key, value in scalars.items()}, refresh=False)
                 bar.update()
-                going_on = self._log_iteration(scalars, max(1, settings.iterations(rounds) // 200), hooks)
+                going_on = self._log_iteration(scalars, log_interval, hooks)
                 return going_on
 
             def skipped(iterations: int) -> None:
@@ -165,12 +178,12 @@ class SimulationLearner(ModelBasedAlgorithm):
                 bar.update(iterations)
 
             def progress(stage: str) -> Progress:
-                return Progress(None if run is None else run.progress(round_, stage), skipped)
+                return Progress(call.folder.progress(number, stage), skipped)
 
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(self._draw_seed())  # initial weights come from torch's global generator
                 try:
-                    self._learn_model(transitions, Round(round_, last, on_iteration, progress))
+                    self._learn_model(transitions, Round(number, last, on_iteration, progress))
                     self._learn_reward(transitions)
                 except BaseException:
                     self.dynamics = known  # half-learnt models are none
@@ -181,21 +194,20 @@ class SimulationLearner(ModelBasedAlgorithm):
         self, envs: Sequence[EnvLike] | None = None, progress_bar: bool = False, n_jobs: int = 1
     ) -> Transitions:
         """Collects the random transitions that :meth:`meta_learn` learns from; arguments as there."""
-        return self._collect(situation_envs(self._require_env(), envs), 0, progress_bar, n_jobs, None)
+        call = _Call(self.hyperparameters.rounds, RunFolder(None, {}), n_jobs, progress_bar)
+        return self._simulate(situation_envs(self._require_env(), envs), 0, call)
 
-    def _collect(
-        self, envs: SituationEnvs, round_: int, progress_bar: bool, n_jobs: int, folder: Path | None
-    ) -> Transitions:
+    def _simulate(self, envs: SituationEnvs, number: int, call: _Call) -> Transitions:
         """Random transitions in round 0, the agent's own planning after that."""
         settings = self.hyperparameters
         make_policy: MakePolicy
-        if round_ == 0:
+        if number == 0:
             n, make_policy = settings.transitions_per_situation, make_held_uniform(settings.action_hold)
         else:
             n, make_policy = settings.round_transitions, self._planning()
-        name = f"Simulating {round_ + 1}/{settings.rounds + 1}" if settings.rounds else "Simulating"
-        with tqdm(total=n * len(envs.sources), desc=name, unit="step", disable=not progress_bar) as bar:
-            return collect(envs.sources, envs.situations, n, make_policy, self._draw_seed(), bar.update, n_jobs, folder)
+        seed, folder = self._draw_seed(), call.folder.transitions(number)
+        with call.bar("Simulating", number, n * len(envs.sources), "step") as bar:
+            return collect(envs.sources, envs.situations, n, make_policy, seed, bar.update, call.n_jobs, folder)
 
     def _planning(self) -> MakePolicy:
         """What makes the agent plan with what it has learnt so far."""

@@ -45,13 +45,48 @@ def test_folder_whose_description_is_damaged_is_refused(tmp_path: Path, content:
 
 def test_round_is_done_once_its_model_is_there(tmp_path: Path) -> None:
     run = RunFolder(tmp_path, FINGERPRINT)
-    assert not run.has_model(0)
-    run.model(0).write_bytes(b"")
-    assert run.has_model(0)
-    assert not run.has_model(1)
-    places = [run.model(0), run.model(1), run.transitions(0), run.transitions(1)]
-    assert len(set(places)) == 4
-    assert all(place.parent == tmp_path for place in places)
+    assert run.finished(0) is None
+    run.finish(0, lambda file: file.write_text("agent"))
+    file = run.finished(0)
+    assert file is not None
+    assert file.read_text() == "agent"
+    assert run.finished(1) is None
+    places = [file, *(run.transitions(i) for i in range(2)), *(run.progress(i, "meta") for i in range(2))]
+    assert len(set(places)) == 5
+    assert all(place is not None and place.parent == tmp_path for place in places)
+
+
+def test_progress_of_a_round_that_is_done_is_removed(tmp_path: Path) -> None:
+    run = RunFolder(tmp_path, FINGERPRINT)
+    files = [run.progress(round_, stage) for round_ in (0, 1, 10) for stage in ("joint", "meta")]
+    for file in files:
+        assert file is not None
+        file.write_bytes(b"")
+    run.finish(1, lambda file: file.write_bytes(b""))
+    assert [file.exists() for file in files if file is not None] == [True, True, False, False, True, True]
+
+
+def test_agent_that_cannot_be_stored_keeps_its_progress(tmp_path: Path) -> None:
+    run = RunFolder(tmp_path, FINGERPRINT)
+    progress = run.progress(0, "meta")
+    assert progress is not None
+    progress.write_bytes(b"")
+
+    def fail(file: Path) -> None:
+        raise OSError("No space left on device")
+
+    with pytest.raises(OSError, match="No space left"):
+        run.finish(0, fail)
+    assert progress.exists()
+    assert run.finished(0) is None
+
+
+def test_no_folder_keeps_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = RunFolder(None, FINGERPRINT)
+    run.finish(0, lambda file: file.write_bytes(b""))
+    assert run.finished(0) is run.transitions(0) is run.progress(0, "meta") is None
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_failed_write_leaves_no_description(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
