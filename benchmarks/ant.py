@@ -74,11 +74,11 @@ class Args(Options):
 
 RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
 DEFAULT_METHODS: dict[str, tuple[str, ...]] = {
-    "unseen": ("famle", "famle-frozen", "famle-nearest", "famle-h", "famle-theta"),
+    "unseen": ("famle", "famle-48", "famle-frozen", "famle-nearest", "famle-theta", "without-embeddings"),
     "validation": ("famle", "famle-window", "famle-h", "famle-theta", "famle-validated"),
     "members": ("members-1", "members-2", "members-3", "famle"),
     "break": ("famle", "famle-window", "famle-frozen"),
-    "untrained": ("famle", "famle-frozen", "famle-theta", "famle-validated"),
+    "untrained": ("famle", "famle-frozen"),
     "intact": ("famle",),
     "curves": ("famle", "famle-frozen", *RIVALS, *PPO_METHODS),
 }
@@ -187,12 +187,13 @@ def run_fleet(method: str, tasks: Sequence[Task], args: Args) -> list[Result]:
 
 
 def _result(result: BrokenRun, situation: Situation) -> Result:
+    """What is stored of a run; its return counts from the damage on."""
     bins = result.speed[: len(result.speed) // BIN * BIN].reshape(-1, BIN).mean(axis=1)
     milliseconds = 1e3 * result.seconds
     return {
         "situation": str(situation),
         "believed": result.believed[-1],
-        "return": round(float(result.speed.sum()), 1),
+        "return": round(float(result.speed[result.break_at :].sum()), 1),
         "recovery": result.recovery(WALKS),
         "speed": [round(float(value), 3) for value in bins],
         "break_at": result.break_at,

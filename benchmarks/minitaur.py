@@ -11,22 +11,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
 import tyro
 
 from benchmarks.compare import compare
 from benchmarks.gait_robots import run
-from benchmarks.harness import Options, load_results
+from benchmarks.harness import Options
 from benchmarks.reporting.report import show
 from benchmarks.task import Task
-from famle_agent.plots import plot_paths
 from famle_envs import Situation
 from famle_envs.minitaur import REALITY
 
 RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
 DEFAULT_METHODS = {
     "reality": ("famle", "famle-frozen", "famle-nearest", "famle-likeliest", *RIVALS, "one-simulator", "oracle"),
-    "home": ("famle", "one-simulator"),
+    "home": ("one-simulator", "famle-frozen", "famle"),
 }
 
 
@@ -49,11 +47,7 @@ def main(args: Args) -> None:
     folder = args.out / f"minitaur-{args.experiment}"
     methods = args.methods or DEFAULT_METHODS[args.experiment]
     compare(methods, [task_of(args.experiment, seed, args) for seed in range(args.replicates)], run, folder, args)
-    results = load_results(folder)
     show(args.out, folder.name)
-    first = {result["method"]: np.array(result["path"]) for result in results if result["seed"] == 0}
-    title = f"Minitaur, {args.experiment}, replicate 0"
-    plot_paths(first, title, args.out / f"minitaur-{args.experiment}.png")
 
 
 if __name__ == "__main__":

@@ -12,15 +12,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import numpy as np
 import tyro
 
 from benchmarks.compare import compare
 from benchmarks.gait_robots import run
-from benchmarks.harness import Options, load_results
+from benchmarks.harness import Options
 from benchmarks.reporting.report import show
 from benchmarks.task import Task
-from famle_agent.plots import plot_paths
 from famle_envs import Situation
 from famle_envs.quadruped import LEGS, REALITY, blocked_leg
 
@@ -29,8 +27,8 @@ RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
 PARTS = ("famle", "famle-frozen", "famle-nearest", "famle-likeliest")
 DEFAULT_METHODS = {
     "later": (*PARTS, *RIVALS),
-    "gap-home": ("one-simulator", "famle"),
-    "gap-reality": ("one-simulator", "famle"),
+    "gap-home": ("one-simulator", "famle-frozen", "famle"),
+    "gap-reality": ("one-simulator", "famle-frozen", "famle"),
 }
 
 
@@ -63,10 +61,7 @@ def main(args: Args) -> None:
         methods = args.methods or DEFAULT_METHODS.get(experiment, (*PARTS, *RIVALS, "oracle"))
         folder = args.out / f"quadruped-{experiment}"
         compare(methods, [task_of(experiment, seed, args) for seed in range(args.replicates)], run, folder, args)
-        results = load_results(folder)
         show(args.out, folder.name)
-        first = {result["method"]: np.array(result["path"]) for result in results if result["seed"] == 0}
-        plot_paths(first, f"Quadruped, {experiment}, replicate 0", args.out / f"quadruped-{experiment}.png", (2.5, 0.0))
 
 
 if __name__ == "__main__":
