@@ -49,10 +49,16 @@ def store_walks(results: Path, method: str, ways: Sequence[Sequence[float]]) -> 
 
 
 def store_runs(results: Path, method: str, returns: Sequence[float], folder: str = "ant-unseen") -> None:
-    """Stores first episodes, one a seed."""
+    """Stores first episodes with the same damage, one a seed."""
     for seed, value in enumerate(returns):
-        milliseconds = {"mean": 13.0, "median": 12.0, "p99": 15.0}
-        store(results, folder, method, seed, **{"return": value}, speed=[value / 1000] * 20, ms_per_step=milliseconds)
+        store_run(results, method, seed, value, folder=folder)
+
+
+def store_run(results: Path, method: str, seed: int, value: float, folder: str = "ant-unseen", **figures: Any) -> None:
+    """Stores one first episode."""
+    milliseconds = {"mean": 13.0, "median": 12.0, "p99": 15.0}
+    figures |= {"return": value, "speed": [value / 1000] * 20, "ms_per_step": milliseconds}
+    store(results, folder, method, seed, **figures)
 
 
 @pytest.fixture
@@ -119,7 +125,8 @@ def test_report_has_a_section_a_picture_and_a_table_for_every_experiment_that_is
     results: Path, arm: Path, ant: Path, quadruped: Path, minitaur: Path
 ) -> None:
     text, out = report(results)
-    for name in ("reacher-paper", "ant-unseen", "quadruped", "minitaur-reality", "time"):
+    ways = ("quadruped-yaw-paths", "minitaur-reality-paths")
+    for name in ("reacher-paper", "ant-unseen", "quadruped", "minitaur-reality", "time", *ways):
         assert (out / f"{name}.png").read_bytes().startswith(PNG)
         assert f"]({name}.png)" in text
     assert {path.stem for path in out.glob("*.csv")} == {
@@ -164,9 +171,9 @@ def test_curves_are_compared_over_the_steps_that_all_have_and_long_budgets_are_t
     assert (rows["ppo"]["solved_in_common_steps"], rows["ppo"]["solved"]) == ("0", "2")
     assert (rows["ppo"]["robot_steps"], rows["famle"]["robot_steps"]) == ("1000", "200")
     assert float(rows["ppo"]["solved_at"]) == 550.0
-    assert float(rows["ppo"]["famle_matched_at"]) == 550.0  # the first above 35
+    assert float(rows["ppo"]["famle_matched_at"]) == 550.0  # the first of three above the mean of 20, 35, 35 and 35
     assert (rows["famle"]["famle_matched_at"], rows["oracle"]["famle_matched_at"]) == ("", "50.0")
-    assert (float(rows["ppo"]["end_median"]), float(rows["famle"]["end_median"])) == (50.0, 35.0)
+    assert (float(rows["ppo"]["end_median"]), float(rows["famle"]["end_median"])) == (50.0, (31.25 + 35.0) / 2)
     assert float(rows["ppo"]["famle_faster_by"]) == pytest.approx(550.0 / 75.0 - 1.0, abs=1e-4)
     assert "mean return over 200 robot steps" in text
     assert "200 robot steps instead of 1,000" in text
@@ -181,7 +188,7 @@ def test_method_with_fewer_steps_is_compared_by_what_it_has(arm: Path) -> None:
         "10.0",
         "1.0",
     )
-    compared = ("mean_return_median", "last_episode_median", "mean_return_famle_better", "solved_in_common_steps")
+    compared = ("mean_return_median", "last_median", "mean_return_famle_better", "solved_in_common_steps")
     assert [row[name] for name in compared] == [""] * 4
     assert "100 robot steps of FAMLE, the paper's settings" in text
     assert "mean return over 200 robot steps" in text
@@ -215,7 +222,7 @@ def test_success_rate_and_gaits_stand_beside_the_paper_s(quadruped: Path) -> Non
     table = next(row for row in ours if "32.6" in row[-1])
     assert table[2:4] == ["15.0 +- 5.0", "100 %"]
     assert table[-1] == "32.6 +- 2.3 gaits, 63.4 +- 4.5 s, 100 %"
-    assert rival[2:4] == ["40.0 +- 0.0", "50 %"]
+    assert rival[2:5] == ["40.0 +- 0.0", "50 %", "167 %"]
     assert rival[-1].startswith("61.8 +- 7.2 gaits, 120.1 +- 13.9 s, 40 %")
     assert rows_of(text, "AMPC, in the paper alone")[0][-1] == "0 %"
     rows = by_name(out / "quadruped-yaw.csv")
@@ -233,6 +240,15 @@ def test_distance_is_the_furthest_and_the_time_until_there(minitaur: Path) -> No
     assert float(by_name(out / "minitaur-reality.csv")["famle"]["distance_median"]) == 4.5
 
 
+def test_famle_s_time_to_where_another_method_gets_stands_beside_it(minitaur: Path) -> None:
+    store_walks(minitaur, "ampc", [[0.0, 1.0, 2.0, 3.0]] * 2)
+    store_walks(minitaur, "oracle", [[0.0, 4.0, 8.0, 9.0]] * 2)
+    text, out = report(minitaur)
+    rows = by_name(out / "minitaur-reality.csv")
+    assert [rows[name]["famle_there_after"] for name in ("ampc", "oracle", "famle")] == ["1.0", "inf", ""]
+    assert rows_of(text, "oracle")[0][4] == "never"
+
+
 def test_probability_of_improvement_is_of_famle_over_the_others(ant: Path) -> None:
     store_runs(ant, "famle-nearest", [2000.0, 2400.0])
     rows = by_name(report(ant)[1] / "ant-unseen.csv")
@@ -243,12 +259,36 @@ def test_probability_of_improvement_is_of_famle_over_the_others(ant: Path) -> No
 
 
 def test_baselines_that_win_are_named(arm: Path) -> None:
-    store_curves(arm, "ampc", [[1.0, 38.0, 38.0, 38.0]] * 2)
+    store_curves(arm, "famle", [[30.0] * 10] * 2)
+    store_curves(arm, "oracle", [[40.0] * 10] * 2)
+    store_curves(arm, "ampc", [[1.0] * 5 + [38.0] * 5] * 2)
     line = next(line for line in report(arm)[0].splitlines() if line.startswith("Better than FAMLE"))
     first, mean, last = line.split(";")
     assert first.endswith(": oracle (return of the first episode)")
-    assert mean == " oracle (mean return over 200 robot steps)"
-    assert last == " AMPC / oracle (return of the episode at 200 robot steps)."
+    assert mean == " oracle (mean return over 500 robot steps)"
+    assert last == " AMPC / oracle (mean return of the last 5 episodes within 500 robot steps)."
+
+
+def test_replicates_with_damages_of_their_own_are_compared_on_the_same_damage(results: Path) -> None:
+    returns = {"famle": [100.0, 1000.0, 2000.0], "ampc": [90.0, 1000.0], "ampc-maml": [90.0, 1900.0, 1900.0]}
+    for method, values in returns.items():
+        for seed, value in enumerate(values):
+            store_run(results, method, seed, value, situation=f"joint {seed} dead")
+    text, out = report(results)
+    rows = by_name(out / "ant-unseen.csv")
+    assert float(rows["ampc"]["return_famle_better"]) == 0.75
+    assert float(rows["ampc-maml"]["return_famle_better"]) == pytest.approx(2 / 3, abs=1e-4)
+    assert "0.75 [0.50, 1.00]" in rows_of(text, "AMPC")[-1][-1]
+
+
+def test_return_of_a_robot_that_breaks_on_the_way_counts_from_then_on(results: Path) -> None:
+    for seed, value in enumerate((560.0, 570.0)):
+        store_run(results, "famle", seed, value, "ant-break", break_at=300, recovery=10)
+    text, out = report(results)
+    row = by_name(out / "ant-break.csv")["famle"]
+    assert float(row["return_median"]) == pytest.approx(565.0 / 0.7, abs=1e-3)
+    assert row["solved"] == "1"  # 570 in 700 steps is above 800 in 1,000
+    assert "return since the damage, per 1,000 robot steps" in text
 
 
 def test_results_without_famle_are_reported_all_the_same(tmp_path: Path) -> None:

@@ -76,4 +76,4 @@ def test_mean_return_weights_episodes_by_their_steps_within_the_common_ones() ->
     assert study.steps == 100
     assert list(study.scores("a", study.measures[1])) == [15.0]
     assert list(study.scores("b", study.measures[1])) == [pytest.approx(0.8 * 10.0 + 0.2 * 40.0)]
-    assert [float(study.scores(method, study.measures[2])[0]) for method in ("a", "b")] == [20.0, 40.0]
+    assert [float(study.scores(method, study.measures[2])[0]) for method in ("a", "b")] == [15.0, 10.0]

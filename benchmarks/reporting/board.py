@@ -34,7 +34,7 @@ TRACES: Mapping[Kind, str] = {
 METRICS = (
     "score/first_episode",
     "score/mean_return",
-    "score/last_episode",
+    "score/last",
     "score/solved_at",
     "score/gaits",
     "score/distance",

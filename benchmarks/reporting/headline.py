@@ -22,23 +22,25 @@ METHODS = (
 """What the table has rows for, where it was measured."""
 
 
-def _median(row: Row) -> str:
-    key = next(name.removesuffix("_median") for name in row if name.endswith("_median"))
+def _median(row: Row, study: Study) -> str:
+    key = study.measures[0].key
     low, median, high = (row[f"{key}_{name}"] for name in ("low", "median", "high"))
     decimals = 0 if abs(median) >= 100 else 1
     return f"{median:.{decimals}f} ({low:.{decimals}f} to {high:.{decimals}f})"
 
 
-def _solved(row: Row) -> str:
-    return f"not in {row['robot_steps']:,}" if np.isinf(row["solved_at"]) else f"{row['solved_at']:,.0f}"
+def _solved(row: Row, study: Study) -> str:
+    if np.isfinite(row["solved_at"]):
+        return f"{row['solved_at']:,.0f}"
+    return f"{row['solved']} of {row['replicates']} in {row['robot_steps']:,}"
 
 
-def _gaits(row: Row) -> str:
+def _gaits(row: Row, study: Study) -> str:
     mean = row["steps_mean"]
     return f"{100 * row['success']:.0f} %" + ("" if mean is None else f", {mean:.1f} +- {row['steps_deviation']:.1f}")
 
 
-COLUMNS: Sequence[tuple[str, str, Callable[[Row], str]]] = (
+COLUMNS: Sequence[tuple[str, str, Callable[[Row, Study], str]]] = (
     ("reacher-paper", "arm: return of the first 50 steps", _median),
     ("reacher-paper", "arm: solved after robot steps", _solved),
     ("ant-curves", "ant: return of the first 1,000 steps", _median),
@@ -55,12 +57,15 @@ _BLOCK = re.compile(r"(<!-- report -->\n).*?(<!-- end of report -->)", re.DOTALL
 
 def headline(studies: Sequence[Study]) -> str:
     """The table in Markdown: a row a method, a column an experiment."""
-    rows = {study.experiment.folder: {row["method"]: row for row in figures(study)} for study in studies}
+    by_folder = {study.experiment.folder: study for study in studies}
+    rows = {folder: {row["method"]: row for row in figures(study)} for folder, study in by_folder.items()}
     columns = [column for column in COLUMNS if column[0] in rows]
     methods = in_order({method for folder, *_ in columns for method in rows[folder]} & set(METHODS))
     table = [["method", *(title for _, title, _ in columns)], ["---"] * (len(columns) + 1)]
     for method in methods:
-        cells = [cell(rows[folder][method]) if method in rows[folder] else "" for folder, _, cell in columns]
+        cells = [
+            cell(row, by_folder[folder]) if (row := rows[folder].get(method)) else "" for folder, _, cell in columns
+        ]
         table.append([look(method).label, *cells])
     counts = {folder: _replicates(rows[folder]) for folder, *_ in columns}
     lines = [f"| {' | '.join(line)} |" for line in table]

@@ -8,8 +8,8 @@ from functools import partial
 import numpy as np
 
 from benchmarks.reporting.looks import look
-from benchmarks.reporting.registry import Experiment, Kind
-from benchmarks.reporting.study import Study
+from benchmarks.reporting.registry import Kind
+from benchmarks.reporting.study import LAST, Study
 from benchmarks.reporting.tables import Row
 
 __all__ = ["document", "section"]
@@ -19,13 +19,13 @@ Column = tuple[str, Callable[[Row], str]]
 
 
 def document(
-    sections: Sequence[str], missing: Sequence[Experiment], unknown: Sequence[str], times: Sequence[str]
+    sections: Sequence[str], missing: Sequence[tuple[str, str, str]], unknown: Sequence[str], times: Sequence[str]
 ) -> str:
     """The whole report.
 
     Args:
         sections: One an experiment.
-        missing: Experiments without results.
+        missing: Experiments without results: title, where they would be, and the command.
         unknown: Folders of results that are no entry of the registry.
         times: Names of the files of pictures of returns against time.
     """
@@ -37,8 +37,8 @@ def document(
             "Interquartile means; times in one run where there are any, else those of the replicates.",
         ]
     if missing:
-        rows = "\n".join(f"| {one.title} | `{one.folder}` | `{one.command}` |" for one in missing)
-        parts += ["## Not measured", f"| experiment | folder | command |\n| --- | --- | --- |\n{rows}"]
+        rows = "\n".join(f"| {title} | `{where}` | `{command}` |" for title, where, command in missing)
+        parts += ["## Not measured", f"| experiment | results | command |\n| --- | --- | --- |\n{rows}"]
     if unknown:
         names = ", ".join(f"`{name}`" for name in unknown)
         parts += [
@@ -73,7 +73,10 @@ with quartiles in round brackets; IQM is the interquartile mean with its bootstr
 *Of the oracle* is the ratio of IQMs over the seeds that both have, turned over where fewer is better, so that 100 % is
 as good as the oracle; in brackets stands how many seeds that is, where a method has more. *P(FAMLE better)* is the
 probability that a replicate of FAMLE does better than one of the other method, a tie counted half, with its bootstrap
-95 % interval; where a method has one replicate the interval is all of [0, 1].""",
+95 % interval; where a method has one replicate the interval is all of [0, 1]. Where each seed has a damage of its own,
+FAMLE is compared with the other method on the same damage alone, and it is the fraction of damages on which it does
+better; in round brackets stands how many they are, where a method has more. Intervals take replicates for independent
+also where they share networks.""",
     """Times of replicates are wall times on machines that did other work too, and none are given of replicates that ran
 in step as one batch; those *in one run*, where methods took turns (`python -m benchmarks.step_time`), can be compared.
 The paper's figures for the quadruped and the Minitaur are of other bodies; they stand beside ours and not against
@@ -84,15 +87,19 @@ _NOTES: Mapping[Kind, str] = {
     "curves": """Solved: three returns in a row above {study.experiment.threshold:g}, counted at the end of the first of
 them; a replicate that never gets there is infinite in the median. Methods are compared over the first {study.steps:,}
 robot steps, but for those of which the title says that they have fewer; *solved at*, *first crossing*, *matches FAMLE*
-(its first episode above FAMLE's median one at the end of these steps) and *its last* episode are over all steps of a
-method. The time of a step contains the simulated robot and all learning on the way.""",
+(the first of three episodes in a row above FAMLE's median of its last five in these steps) and *its last* episodes are
+over all steps of a method. An episode is the resolution of all of these: where FAMLE is solved with the first one,
+*faster by* counts episodes. Returns are those of the life itself, PPO's with the noise by which it explores. The time
+of a step contains the simulated robot and all learning on the way.""",
     "episode": """A robot walks again as soon as its mean speed over 100 steps is above 0.8 m/s, the paper's solved
 mark; the steps since the damage are a median, in which one that never does is infinite. The time is the median of a
 control step, with adaptation.""",
     "gaits": """Steps are the gaits of the runs that reach the goal, within {study.experiment.budget}. A gait takes a
-second; the paper's took about two. The time of a plan is without adaptation.""",
+second; the paper's took about two. *FAMLE faster by* compares the means of these. The time of a plan is without
+adaptation.""",
     "distance": """The largest distance and the seconds until then, medians over replicates of {study.experiment.budget}
-gaits, a second each. The time of a plan is without adaptation.""",
+gaits, a second each; *FAMLE is there* when half of its replicates have come as far as the method's median. The time of
+a plan is without adaptation.""",
 }
 """How the first table of each kind is to be read."""
 
@@ -113,7 +120,7 @@ def _curves(study: Study) -> list[Column]:
         ("FAMLE faster by", lambda row: _percent(row.get("famle_faster_by"))),
         ("matches FAMLE", lambda row: _steps(row.get("famle_matched_at"))),
         ("2nd episode", lambda row: _number(row.get("second_episode_median"))),
-        ("its last", lambda row: _spread(row, "end")),
+        (f"its last {LAST}", lambda row: _spread(row, "end")),
         *_times(study),
     ]
 
@@ -138,6 +145,7 @@ def _gaits(study: Study) -> list[Column]:
     return [
         ("steps, mean +- deviation", lambda row: _deviation(row, "steps")),
         ("success rate", lambda row: _percent(row.get("success"))),
+        ("FAMLE faster by", lambda row: _percent(row.get("famle_faster_by"))),
         ("ms / plan", lambda row: _number(row.get("ms"))),
     ]
 
@@ -146,6 +154,7 @@ def _distance(study: Study) -> list[Column]:
     return [
         ("max distance (m)", lambda row: _number(row.get("furthest_median"))),
         ("interaction time (s)", lambda row: _steps(row.get("furthest_after_median"))),
+        ("FAMLE is there after (s)", lambda row: _steps(row.get("famle_there_after"))),
         ("falls", lambda row: _count(row, "falls")),
         ("ms / plan", lambda row: _number(row.get("ms"))),
     ]
@@ -233,7 +242,9 @@ def _of_oracle(row: Row, key: str) -> str:
 def _better(row: Row, key: str) -> str:
     if f"{key}_famle_better" not in row:
         return "-"
-    return "{:.2f} [{:.2f}, {:.2f}]".format(*(row[f"{key}_famle_better{suffix}"] for suffix in ("", "_low", "_high")))
+    cell = "{:.2f} [{:.2f}, {:.2f}]".format(*(row[f"{key}_famle_better{suffix}"] for suffix in ("", "_low", "_high")))
+    seeds = row[f"{key}_famle_better_seeds"]
+    return cell + (f" ({seeds})" if seeds != row["replicates"] else "")
 
 
 def _decimals(row: Row, key: str, name: str) -> str:

@@ -16,7 +16,7 @@ from benchmarks.reporting.statistics import Array, interquartile_mean
 from benchmarks.reporting.study import Study, quartiles_over_steps
 from famle_agent.plots import style
 
-__all__ = ["draw", "draw_times"]
+__all__ = ["draw", "draw_paths", "draw_times"]
 
 _PAPER: Mapping[str, Any] = {"marker": "D", "color": "0.35", "capsize": 3}
 """How the paper's own figures are drawn."""
@@ -56,6 +56,29 @@ def _times(axes: Axes, study: Study) -> None:
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter(NullFormatter())
     style(axes, "time per control step (ms)", measure.label, _wrapped(study.experiment.title, 50))
+
+
+def draw_paths(study: Study) -> Figure:
+    """The ways of all replicates from above, a panel a method, and where they were to get to."""
+    columns = min(3, len(study.runs))
+    rows = -(-len(study.runs) // columns)
+    figure = Figure(figsize=(3.4 * columns, 2.0 * rows + 0.8), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flatten()
+    for axes, (method, runs) in zip(panels, study.runs.items(), strict=False):
+        for run in runs:
+            x, y = np.array(run["path"]).T
+            axes.plot(x, y, marker=".", markersize=3, linewidth=1, alpha=0.5, color=look(method).colour)
+        if study.experiment.goal is not None:
+            axes.plot(*study.experiment.goal, marker="*", markersize=12, color="0.3", linestyle="none")
+        axes.set_aspect("equal", adjustable="box")
+        style(axes, "", "", f"{look(method).label} (n = {len(runs)})")
+        axes.title.set(fontsize="small", color=look(method).colour)
+    for axes in panels[len(study.runs) :]:
+        axes.set_visible(False)
+    figure.supxlabel("x (m)")
+    figure.supylabel("y (m)")
+    figure.suptitle(_wrapped(study.experiment.title, 60), fontsize="medium")
+    return figure
 
 
 # --- learning curves --------------------------------------------------------------------------------------------------
@@ -102,6 +125,7 @@ def _draw_gaits(studies: Sequence[Study]) -> Figure:
         style(axes, "gaits to the goal", "", _wrapped(study.title, 44))
         axes.title.set_fontsize("medium")
     figure.axes[0].set_yticks(list(rows.values()), [look(name).label for name in rows])
+    _colour_labels(figure.axes[0], methods)
     figure.axes[0].set_ylim(len(rows) - 0.4, -0.6)
     return figure
 
@@ -166,6 +190,7 @@ def _points(axes: Axes, study: Study) -> None:
     if np.isfinite(study.experiment.threshold):
         axes.axvline(study.experiment.threshold, color="0.4", linestyle="--", linewidth=1)
     axes.set_yticks(range(len(names)), names)
+    _colour_labels(axes, list(study.runs))
     axes.set_ylim(len(names) - 0.4, -0.6)
     style(axes, f"{measure.label}\nof each replicate; interquartile mean, 95 % interval", "")
 
@@ -177,9 +202,15 @@ def _speeds(axes: Axes, study: Study) -> None:
         drawn = look(method)
         axes.plot(x, median, color=drawn.colour, linestyle=drawn.line)
         axes.fill_between(x, low, high, color=drawn.colour, alpha=0.15, linewidth=0)
-        for breaks in {run["break_at"] for run in runs if run.get("break_at")}:
-            axes.axvline(breaks, color="0.4", linestyle=":", linewidth=1)
+    for breaks in study.breaks:
+        axes.axvline(breaks, color="0.4", linestyle=":", linewidth=1)
     style(axes, "robot steps", "forward speed (m/s), median and quartiles")
+
+
+def _colour_labels(axes: Axes, methods: Sequence[str]) -> None:
+    """Gives the first labels of the y axis the colours of the methods, which other panels are read by."""
+    for label, method in zip(axes.get_yticklabels(), methods, strict=False):
+        label.set_color(look(method).colour)
 
 
 def _mean_and_error(scores: Array) -> tuple[float, Array]:

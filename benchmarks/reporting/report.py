@@ -15,8 +15,9 @@ from benchmarks.harness import write_whole
 from benchmarks.reporting.board import write_board
 from benchmarks.reporting.headline import headline, insert
 from benchmarks.reporting.markdown import document, section
-from benchmarks.reporting.pictures import draw, draw_times
-from benchmarks.reporting.registry import EXPERIMENTS, Experiment, experiment_in
+from benchmarks.reporting.pictures import draw, draw_paths, draw_times
+from benchmarks.reporting.registry import EXPERIMENTS, experiment_in
+from benchmarks.reporting.sine import COMMAND, TITLE, read_sine
 from benchmarks.reporting.study import Study, read_study
 from benchmarks.reporting.tables import figures, replicates, to_csv
 
@@ -52,8 +53,12 @@ class Report:
             raise FileNotFoundError(
                 f"{self.results} holds no results; run a benchmark first, such as: {EXPERIMENTS[0].command}"
             )
-        missing = [experiment for experiment, study in found.items() if study is None]
-        for name, content in {**_pictures(studies), **_texts(studies, missing, self._unknown())}.items():
+        missing = [(one.title, one.folder, one.command) for one, study in found.items() if study is None]
+        sine = read_sine(self.results)
+        missing += [] if sine else [(TITLE, "sine.json", COMMAND)]
+        more, pictures = ([], {}) if sine is None else ([sine[0]], {"sine.png": sine[1]})
+        texts = _texts(studies, more, missing, self._unknown())
+        for name, content in {**_pictures(studies), **pictures, **texts}.items():
             write_whole(self.out / name, content)
         if self.readme is not None:
             insert(headline(studies), self.readme)
@@ -80,17 +85,20 @@ def show(results: Path, folder: str) -> None:
     Console(width=_WIDTH).print(Markdown(section(study, figures(study), pictures=[])))
 
 
-def _texts(studies: Sequence[Study], missing: Sequence[Experiment], unknown: Sequence[str]) -> dict[str, bytes]:
-    """The report and its tables by the names of their files."""
+def _texts(
+    studies: Sequence[Study], more: Sequence[str], missing: Sequence[tuple[str, str, str]], unknown: Sequence[str]
+) -> dict[str, bytes]:
+    """The report, with more sections at its end, and its tables by the names of their files."""
     texts, sections, drawn = dict[str, str](), list[str](), set[str]()
     for study in studies:
-        rows, picture = figures(study), study.experiment.picture_name
-        texts[f"{study.experiment.folder}.csv"] = to_csv(rows)
-        sections.append(section(study, rows, [] if picture in drawn else [f"{picture}.png"]))
+        rows, folder, picture = figures(study), study.experiment.folder, study.experiment.picture_name
+        texts[f"{folder}.csv"] = to_csv(rows)
+        shown = [] if picture in drawn else [f"{picture}.png"]
+        sections.append(section(study, rows, [*shown, *([f"{folder}-paths.png"] if _walks(study) else [])]))
         drawn.add(picture)
     texts["replicates.csv"] = to_csv([row for study in studies for row in replicates(study)])
     texts["report.md"] = document(
-        [f"## All robots\n\n{headline(studies)}", *sections],
+        [f"## All robots\n\n{headline(studies)}", *sections, *more],
         missing,
         unknown,
         ["time.png"] if _with_returns(studies) else [],
@@ -104,7 +112,13 @@ def _pictures(studies: Sequence[Study]) -> dict[str, bytes]:
     for study in studies:
         groups.setdefault(study.experiment.picture_name, []).append(study)
     pictures = {f"{name}.png": _png(draw(group)) for name, group in groups.items()}
+    pictures |= {f"{study.experiment.folder}-paths.png": _png(draw_paths(study)) for study in studies if _walks(study)}
     return pictures | ({"time.png": _png(draw_times(shown))} if (shown := _with_returns(studies)) else {})
+
+
+def _walks(study: Study) -> bool:
+    """Whether it has ways that can be seen from above."""
+    return study.experiment.kind in ("gaits", "distance")
 
 
 def _with_returns(studies: Sequence[Study]) -> list[Study]:

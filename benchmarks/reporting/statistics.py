@@ -65,15 +65,18 @@ def interquartile_mean(values: Sequence[float] | Array) -> tuple[float, float, f
     return mean, float(interval.low), float(interval.high)
 
 
-def probability_of_improvement(x: Sequence[float] | Array, y: Sequence[float] | Array) -> tuple[float, float, float]:
+def probability_of_improvement(
+    x: Sequence[float] | Array, y: Sequence[float] | Array, paired: bool = False
+) -> tuple[float, float, float]:
     """P(X > Y), a tie counted half, and its 95 % bootstrap interval.
 
-    Both groups are resampled, each for itself. One replicate says nothing of how replicates differ: the interval is
-    then all of [0, 1].
+    One replicate says nothing of how replicates differ: the interval is then all of [0, 1].
 
     Args:
         x: A figure of each replicate of one group, (n,).
         y: The same figure of the other group's, (m,).
+        paired: Whether x_i is compared with y_i alone (n = m), and pairs are resampled. Else every x_i is compared with
+            every y_j, and each group is resampled for itself.
 
     Raises:
         ValueError: A group is empty.
@@ -81,13 +84,18 @@ def probability_of_improvement(x: Sequence[float] | Array, y: Sequence[float] | 
     groups = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if not all(len(group) for group in groups):
         raise ValueError("Both groups need a replicate to be compared.")
-    p = float(_wins(*groups))
+    wins = _pairs_won if paired else _wins
+    p = float(wins(*groups))
     if min(len(group) for group in groups) < 2:
         return p, 0.0, 1.0
     interval = stats.bootstrap(
-        groups, _wins, n_resamples=_RESAMPLES, method="percentile", rng=np.random.default_rng(0)
+        groups, wins, paired=paired, n_resamples=_RESAMPLES, method="percentile", rng=np.random.default_rng(0)
     ).confidence_interval
     return p, float(interval.low), float(interval.high)
+
+
+def _pairs_won(x: Array, y: Array, axis: int = -1) -> Any:
+    return (0.5 + 0.5 * np.sign(x - y)).mean(axis=axis)
 
 
 def _wins(x: Array, y: Array, axis: int = -1) -> Any:

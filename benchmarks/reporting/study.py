@@ -15,13 +15,16 @@ from benchmarks.reporting.looks import in_order, look
 from benchmarks.reporting.registry import Experiment, Kind
 from benchmarks.reporting.statistics import Array, quartiles
 
-__all__ = ["ROBOT_ALONE", "SUBJECT", "Measure", "Study", "quartiles_over_steps", "read_study"]
+__all__ = ["LAST", "ROBOT_ALONE", "SUBJECT", "Measure", "Study", "quartiles_over_steps", "read_study"]
 
 SUBJECT = "famle"
 """The method that all others are compared with."""
 
 ROBOT_ALONE = "robot alone"
 """The raw cost of a control step among the times that were measured in one run."""
+
+LAST = 5
+"""The episodes at the end of a learning curve whose mean stands for where it has got to: a single one is noisy."""
 
 _NEEDED: Mapping[Kind, tuple[str, ...]] = {
     "curves": ("returns", "lengths", "seconds_per_step"),
@@ -88,10 +91,11 @@ class Study:
             return (
                 Measure("first_episode", "return of the first episode", lambda run: float(run["returns"][0])),
                 Measure("mean_return", f"mean return over {at}", self._mean_return, steps=self.steps),
-                Measure("last_episode", f"return of the episode at {at}", self._last_return, steps=self.steps),
+                Measure("last", f"mean return of the last {LAST} episodes within {at}", self._last, steps=self.steps),
             )
         if self.experiment.kind == "episode":
-            return (Measure("return", "return of the first episode", lambda run: float(run["return"])),)
+            label = "return since the damage, per 1,000 robot steps" if self.breaks else "return of the first episode"
+            return (Measure("return", label, self._return_since_damage),)
         if self.experiment.kind == "gaits":
             label = f"gaits to the goal, {limit + 1} where it is not reached"
             return (Measure("gaits", label, lambda run: float(run["gaits"] if run["reached"] else limit + 1), False),)
@@ -101,15 +105,25 @@ class Study:
         """A figure of each replicate of a method, (n,)."""
         return np.array([measure.score(run) for run in self.runs[method]])
 
-    def of_oracle(self, method: str, measure: Measure) -> tuple[Array, Array] | None:
-        """A figure of a method and of the oracle over the seeds that both have, each (n,); None without such seeds."""
-        if "oracle" in self.runs and not self.has("oracle", measure):
+    def shared(self, method: str, other: str, measure: Measure) -> tuple[Array, Array] | None:
+        """A figure of two methods over the seeds that both have, each (n,); None without such seeds."""
+        if not all(name in self.runs and self.has(name, measure) for name in (method, other)):
             return None
-        ours, oracle = ({run["seed"]: run for run in self.runs.get(name, ())} for name in (method, "oracle"))
-        if not (shared := ours.keys() & oracle.keys()):
+        ours, theirs = ({run["seed"]: run for run in self.runs[name]} for name in (method, other))
+        if not (seeds := ours.keys() & theirs.keys()):
             return None
-        first, second = (np.array([measure.score(runs[seed]) for seed in sorted(shared)]) for runs in (ours, oracle))
+        first, second = (np.array([measure.score(runs[seed]) for seed in sorted(seeds)]) for runs in (ours, theirs))
         return first, second
+
+    @cached_property
+    def paired(self) -> bool:
+        """Whether each seed has a damage of its own, so that replicates are compared with those of the same seed."""
+        return len({run.get("situation") for runs in self.runs.values() for run in runs}) > 1
+
+    @cached_property
+    def breaks(self) -> frozenset[int]:
+        """The steps before which robots break on the way; empty where they are broken from the first one."""
+        return frozenset(run["break_at"] for runs in self.runs.values() for run in runs if run.get("break_at"))
 
     def milliseconds(self, run: Result) -> float | None:
         """Wall time of a replicate's control step: the mean with all learning in learning curves, else the median.
@@ -176,9 +190,15 @@ class Study:
         ends = np.minimum(np.cumsum(run["lengths"]), self.steps)
         return float(np.average(run["returns"], weights=np.diff(ends, prepend=0)))
 
-    def _last_return(self, run: Result) -> float:
-        """The return of the episode that the last step which all have belongs to."""
-        return float(run["returns"][np.searchsorted(np.cumsum(run["lengths"]), self.steps)])
+    def _last(self, run: Result) -> float:
+        """The mean return of the last episodes that end within the steps which all have."""
+        whole = int(np.searchsorted(np.cumsum(run["lengths"]), self.steps, side="right"))
+        return float(np.mean(run["returns"][max(0, whole - LAST) : whole]))
+
+    def _return_since_damage(self, run: Result) -> float:
+        """The return since the damage, as if that had lasted for the whole episode."""
+        budget = self.experiment.budget
+        return float(run["return"] * budget / (budget - run.get("break_at", 0)))
 
 
 def quartiles_over_steps(traces: Sequence[tuple[Array, Array]], hold: bool = False) -> tuple[Array, Array]:

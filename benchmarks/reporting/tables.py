@@ -14,6 +14,7 @@ from benchmarks.harness import Result
 from benchmarks.reporting.looks import look
 from benchmarks.reporting.registry import Kind
 from benchmarks.reporting.statistics import (
+    Array,
     first_crossing,
     interquartile_mean,
     median_steps,
@@ -21,7 +22,7 @@ from benchmarks.reporting.statistics import (
     quartiles,
     solved_at,
 )
-from benchmarks.reporting.study import ROBOT_ALONE, SUBJECT, Measure, Study
+from benchmarks.reporting.study import LAST, ROBOT_ALONE, SUBJECT, Measure, Study
 
 __all__ = ["Row", "figures", "replicates", "to_csv"]
 
@@ -85,7 +86,7 @@ def _spread(study: Study, method: str, measure: Measure) -> Row:
     low, median, high = quartiles(scores)
     mean, mean_low, mean_high = interquartile_mean(scores)
     row = {"median": median, "low": low, "high": high, "iqm": mean, "iqm_low": mean_low, "iqm_high": mean_high}
-    if pair := study.of_oracle(method, measure):
+    if pair := study.shared(method, "oracle", measure):
         ours, oracle = (interquartile_mean(values)[0] for values in pair)
         over, under = (ours, oracle) if measure.higher_is_better else (oracle, ours)
         row |= {"of_oracle": over / under if under > 0 else None, "oracle_seeds": len(pair[0])}
@@ -104,15 +105,21 @@ def _improvement(study: Study, method: str, measure: Measure) -> Row:
     """The probability that a replicate of FAMLE is better than one of another method."""
     if method == SUBJECT or SUBJECT not in study.runs or not study.has(SUBJECT, measure):
         return {}
-    sign = 1.0 if measure.higher_is_better else -1.0
-    ours, theirs = (sign * study.scores(name, measure) for name in (SUBJECT, method))
-    names = (f"{measure.key}_famle_better{suffix}" for suffix in ("", "_low", "_high"))
-    return dict(zip(names, probability_of_improvement(ours, theirs), strict=True))
+    if study.paired:
+        groups = study.shared(SUBJECT, method, measure)
+    else:
+        groups = study.scores(SUBJECT, measure), study.scores(method, measure)
+    if groups is None:
+        return {}
+    ours, theirs = groups if measure.higher_is_better else (-groups[0], -groups[1])
+    p, low, high = probability_of_improvement(ours, theirs, study.paired)
+    row = {"": p, "_low": low, "_high": high, "_seeds": len(theirs)}
+    return {f"{measure.key}_famle_better{name}": value for name, value in row.items()}
 
 
 def _curves(study: Study, method: str) -> Row:
     threshold, runs = study.experiment.threshold, study.runs[method]
-    solved = _solved_at(study, runs)
+    solved = _solved_at(runs, threshold)
     early = [_within(run, study.steps) for run in runs]
     second = [run["returns"][1] for run in runs if len(run["returns"]) > 1]
     row: Row = {
@@ -121,10 +128,10 @@ def _curves(study: Study, method: str) -> Row:
         "solved": sum(step is not None for step in solved),
         "solved_at": median_steps(solved),
         "famle_faster_by": _famle_faster_by(study, runs),
-        "first_crossing": _crossed_at(runs, threshold),
+        "first_crossing": median_steps([first_crossing(run["returns"], run["lengths"], threshold) for run in runs]),
         "famle_matched_at": _famle_matched_at(study, runs),
     }
-    row["end_low"], row["end_median"], row["end_high"] = quartiles([run["returns"][-1] for run in runs])
+    row["end_low"], row["end_median"], row["end_high"] = quartiles([np.mean(run["returns"][-LAST:]) for run in runs])
     if study.lived[method] >= study.steps:
         row["solved_in_common_steps"] = sum(solved_at(*run, threshold) is not None for run in early)
     return row
@@ -134,30 +141,45 @@ def _episode(study: Study, method: str) -> Row:
     runs = study.runs[method]
     recovery = [run.get("recovery") for run in runs]
     return {
-        "solved": sum(run["return"] > study.experiment.threshold for run in runs),
+        "solved": int(np.sum(study.scores(method, study.measures[0]) > study.experiment.threshold)),
         "recovered": sum(steps is not None for steps in recovery),
         "recovery": median_steps(recovery),
     }
 
 
 def _gaits(study: Study, method: str) -> Row:
-    runs = study.runs[method]
-    gaits = [run["gaits"] for run in runs if run["reached"]]
+    gaits = _gaits_to_goal(study, method)
+    famle = _gaits_to_goal(study, SUBJECT)
     return {
-        "success": len(gaits) / len(runs),
+        "success": len(gaits) / len(study.runs[method]),
         "steps_mean": np.mean(gaits) if gaits else None,
         "steps_deviation": np.std(gaits) if gaits else None,
+        "famle_faster_by": np.mean(gaits) / np.mean(famle) - 1.0 if gaits and famle and method != SUBJECT else None,
     }
+
+
+def _gaits_to_goal(study: Study, method: str) -> list[int]:
+    """Of the replicates that reach it."""
+    return [run["gaits"] for run in study.runs.get(method, ()) if run["reached"]]
 
 
 def _distance(study: Study, method: str) -> Row:
     runs = study.runs[method]
     ways = [study.trace(run)[1] for run in runs]
-    return {
-        "furthest_median": np.median([way.max() for way in ways]),
-        "furthest_after_median": np.median([way.argmax() for way in ways]),
-        "falls": sum(run["fell"] for run in runs),
-    }
+    furthest, after = (
+        float(np.median(values)) for values in zip(*((way.max(), way.argmax()) for way in ways), strict=True)
+    )
+    row: Row = {"furthest_median": furthest, "furthest_after_median": after, "falls": sum(run["fell"] for run in runs)}
+    if method != SUBJECT and SUBJECT in study.runs:
+        famle = median_steps([_gaits_to(study.trace(run)[1], furthest) for run in study.runs[SUBJECT]])
+        row["famle_there_after"] = famle
+    return row
+
+
+def _gaits_to(way: Array, x: float) -> int | None:
+    """The gaits after which a way gets to x."""
+    there = np.flatnonzero(way >= x)
+    return int(there[0]) if len(there) else None
 
 
 _KINDS: Mapping[Kind, Callable[[Study, str], Row]] = {
@@ -175,8 +197,8 @@ def _within(run: Result, steps: int) -> tuple[list[float], list[int]]:
     return run["returns"][:whole], run["lengths"][:whole]
 
 
-def _solved_at(study: Study, runs: Sequence[Result]) -> list[int | None]:
-    return [solved_at(run["returns"], run["lengths"], study.experiment.threshold) for run in runs]
+def _solved_at(runs: Sequence[Result], threshold: float) -> list[int | None]:
+    return [solved_at(run["returns"], run["lengths"], threshold) for run in runs]
 
 
 def _famle_faster_by(study: Study, runs: Sequence[Result]) -> float | None:
@@ -184,20 +206,16 @@ def _famle_faster_by(study: Study, runs: Sequence[Result]) -> float | None:
     subject = study.runs.get(SUBJECT)
     if subject is None or runs is subject:
         return None
-    famle, other = (median_steps(_solved_at(study, some)) for some in (subject, runs))
+    famle, other = (median_steps(_solved_at(some, study.experiment.threshold)) for some in (subject, runs))
     return other / famle - 1.0 if np.isfinite(famle) else None
 
 
 def _famle_matched_at(study: Study, runs: Sequence[Result]) -> float | None:
-    """When a method has its first episode above FAMLE's median one at the end of the steps that all have."""
+    """When a method begins three episodes in a row above FAMLE's median at the end of the steps that all have."""
     *_, last = study.measures
     if SUBJECT not in study.runs or runs is study.runs[SUBJECT] or not study.has(SUBJECT, last):
         return None
-    return _crossed_at(runs, float(np.median(study.scores(SUBJECT, last))))
-
-
-def _crossed_at(runs: Sequence[Result], threshold: float) -> float:
-    return median_steps([first_crossing(run["returns"], run["lengths"], threshold) for run in runs])
+    return median_steps(_solved_at(runs, float(np.median(study.scores(SUBJECT, last)))))
 
 
 def _published(study: Study, method: str) -> Row:
