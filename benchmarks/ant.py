@@ -122,8 +122,11 @@ def with_members(task: Task, members: int) -> FAMLE:
 def oracle(task: Task) -> FAMLE:
     """The upper line: from scratch on the very test situation, 28,000 simulated steps of it."""
     budget: dict[str, Any] = {
-        **{"transitions_per_situation": 20_000, "joint_iterations": 3000},
-        **{"rounds": 4, "round_transitions": 2000, "round_iterations": 2000},
+        "transitions_per_situation": 20_000,
+        "joint_iterations": 3000,
+        "rounds": 4,
+        "round_transitions": 2000,
+        "round_iterations": 2000,
     }
     agent = FAMLE("ant", seed=task.seed, device="cpu", pretrained=False, compose=False, **budget)
     path = task.cache / f"ant-oracle-{str(task.situation).replace(' ', '_')}-{task.seed}.zip"

@@ -85,7 +85,8 @@ class _Historian(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
-        self._save()
+        if not isinstance(self.model, ModelBasedAgent):
+            self._save()
 
     def _save(self) -> None:
         if self._saved is not None and time.perf_counter() - self._saved_at >= self._save_every:

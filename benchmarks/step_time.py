@@ -32,8 +32,13 @@ from famle_agent import AMPC, AMPCMAML, FAMLE
 from famle_agent.robots import known_robots
 
 HARDLY: Mapping[str, Any] = {
-    **{"rounds": 0, "joint_iterations": 1, "meta_iterations": 1, "transitions_per_situation": 200},
-    **{"pretrained": False, "device": "cpu", "seed": 0},
+    "rounds": 0,
+    "joint_iterations": 1,
+    "meta_iterations": 1,
+    "transitions_per_situation": 200,
+    "pretrained": False,
+    "device": "cpu",
+    "seed": 0,
 }
 """Settings of an agent that is as slow as a trained one."""
 

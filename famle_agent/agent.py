@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import as_file
 from pathlib import Path
@@ -80,7 +81,8 @@ class ModelBasedAgent(SimulationLearner):
         """Lives on the robot (the agent's environment), adapting all the time: Algorithm 2 for some steps.
 
         Meta-learns first where that has not been done. What was learnt stays: :meth:`predict` without a state
-        goes on from there, until :meth:`forget`.
+        goes on from there, until :meth:`forget`. To callbacks each step is a rollout, as with an off-policy algorithm
+        that learns at every step.
 
         Args:
             total_timesteps: Steps of the robot, all robots of a ``VecEnv`` counted.
@@ -99,16 +101,20 @@ class ModelBasedAgent(SimulationLearner):
         hooks.on_training_start(locals(), globals())
         loop, state = self._loop(), self._state_of(env.num_envs)
         starts = torch.as_tensor(self._last_episode_starts, dtype=torch.bool, device=self.device)
+        nobody = torch.zeros_like(starts)
         while self.num_timesteps < total_timesteps:
+            hooks.on_rollout_start()
             action, state = loop.act(state, self._tensor(self._last_obs), starts, self._generator)
-            self._last_obs, _, dones, infos = env.step(self._to_env(action))  # type: ignore[assignment]
+            new_obs, rewards, dones, infos = env.step(self._to_env(action))
             self.num_timesteps += env.num_envs
-            self._last_episode_starts, starts = dones, torch.as_tensor(dones, device=self.device)
-            state = self._live = loop.remember(state, self._tensor(self._last_obs), starts)
+            state = self._live = loop.remember(state, self._tensor(_before_reset(new_obs, dones, infos)), nobody)
+            self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
+            starts = torch.as_tensor(dones, device=self.device)
             self._update_info_buffer(infos, dones)
             hooks.update_locals(locals())
             if not hooks.on_step():
                 break
+            hooks.on_rollout_end()
             self._log_episodes(state, int(dones.sum()), log_interval)
         hooks.on_training_end()
         return self
@@ -336,3 +342,9 @@ class ModelBasedAgent(SimulationLearner):
         """From [-1, 1] to the action space."""
         actions = self._action_scale().from_unit(action).cpu().numpy().astype(self.action_space.dtype)
         return np.clip(actions, self.action_space.low, self.action_space.high)
+
+
+def _before_reset(obs: Any, dones: Array, infos: Sequence[Mapping[str, Any]]) -> Array:
+    """Where robots have got to; of one whose episode has ended, ``obs`` is already the next one's start."""
+    ended = [info["terminal_observation"] if done else own for own, done, info in zip(obs, dones, infos, strict=True)]
+    return np.stack(ended)

@@ -26,8 +26,15 @@ class _OneModelAgent(ModelBasedAgent):
     """An agent that does not tell situations apart: its model has one embedding, which never changes."""
 
     _implied: ClassVar[Mapping[str, Any]] = {
-        **{"embedding_dim": 1, "embedding_lr": 0.0, "adapt_embedding_lr": 0.0, "joint_embedding_lr": 0.0},
-        **{"gate_actions": False, "interaction_rank": 0, "compose": False, "hazard": 0.0, "spread_members": False},
+        "embedding_dim": 1,
+        "embedding_lr": 0.0,
+        "adapt_embedding_lr": 0.0,
+        "joint_embedding_lr": 0.0,
+        "gate_actions": False,
+        "interaction_rank": 0,
+        "compose": False,
+        "hazard": 0.0,
+        "spread_members": False,
     }
 
     @property
@@ -81,7 +88,10 @@ class AMPC(_OneModelAgent):
 
     _implied: ClassVar[Mapping[str, Any]] = {
         **_OneModelAgent._implied,
-        **{"rounds": 0, "joint_iterations": 0, "meta_iterations": 0, "keep_adapting": True},
+        "rounds": 0,
+        "joint_iterations": 0,
+        "meta_iterations": 0,
+        "keep_adapting": True,
     }
 
     def _method(self, overrides: Mapping[str, Any]) -> str:

@@ -113,7 +113,7 @@ def save_agent(agent: ModelBasedAgent, file: File) -> None:
         "env": agent._env_spec,
         "needs_reward_fn": agent._reward_fn is not None,
         "seed": agent.seed,
-        "live": None if live is None else {"steps": live.steps, "adaptations": live.belief.adaptations},
+        "live": None if live is None else live.counts,
     }
     parts: dict[str, dict[str, Tensor]] = {
         "dynamics": {} if agent.dynamics is None else agent.dynamics.state_dict(),
@@ -130,6 +130,8 @@ def load_agent(
     cls: type[Agent], file: File, env: Any, *, reward_fn: Any, device: torch.device | str, **overrides: Any
 ) -> Agent:
     """Makes an agent from a file: see :meth:`ModelBasedAgent.load`."""
+    if "mode" in overrides:
+        raise ValueError("A stored agent has all its settings, and no other mode; give load() the settings to change.")
     meta, tensors = read_checkpoint(file)
     if (kind := meta.get("class")) != cls.__name__:
         raise ValueError(
@@ -166,6 +168,7 @@ def load_agent(
         raise ValueError(
             f"The file's weights do not fit its settings; it is damaged, or an override changed the network: {error}"
         ) from error
+    agent.set_random_seed(overrides.get("seed"))
     return agent
 
 

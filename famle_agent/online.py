@@ -46,6 +46,11 @@ class OnlineState:
         plan = torch.cat([self.plan, torch.zeros_like(self.plan[:, :1]).repeat(1, horizon, 1)], dim=1)[:, :horizon]
         return replace(self, memory=self.memory.resized(memory_size, window), plan=plan)
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """What :meth:`to_tensors` leaves out, for a checkpoint."""
+        return {"steps": self.steps, "adaptations": self.belief.adaptations, "adapted_at": self.adapted_at}
+
     def to_tensors(self) -> dict[str, Tensor]:
         """All but :attr:`last` and the counts, for a checkpoint."""
         tensors = {f"theta.{name}": value for name, value in self.belief.theta.items()}
@@ -54,14 +59,14 @@ class OnlineState:
         return tensors | belief | {"plan": self.plan}
 
     @classmethod
-    def from_tensors(cls, tensors: dict[str, Tensor], steps: int, adaptations: int) -> OnlineState:
-        """The inverse of :meth:`to_tensors`."""
+    def from_tensors(cls, tensors: dict[str, Tensor], steps: int, adaptations: int, adapted_at: int = 0) -> OnlineState:
+        """The inverse of :meth:`to_tensors`; the counts are :attr:`counts`, of which older files lack the last."""
 
         def part(prefix: str) -> dict[str, Tensor]:
             return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
         belief = Belief(part("theta."), tensors["h"], tensors["log_posterior"], tensors["candidate"], adaptations)
-        return cls(Memory(**part("memory.")), belief, tensors["plan"], steps=steps)
+        return cls(Memory(**part("memory.")), belief, tensors["plan"], steps=steps, adapted_at=adapted_at)
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,6 @@ class SimulationLearner(ModelBasedAlgorithm):
                 source if isinstance(source, Transitions) else self._simulate(source, number, call)
             )
             transitions = new if transitions is None else transitions.followed_by(new)
-            self.situations = transitions.situations
             if (agent := call.folder.finished(number)) is not None:
                 self._restore(agent)
                 self.num_timesteps = self.hyperparameters.iterations(number, last=number == call.rounds)
@@ -163,7 +162,8 @@ class SimulationLearner(ModelBasedAlgorithm):
         """Learns the model, and the reward where it is not known; says whether no callback ended it."""
         settings, last, going_on = self.hyperparameters, number == call.rounds, True
         log_interval = max(1, settings.iterations(call.rounds) // 200)
-        left, known = settings.iterations(number, last) - self.num_timesteps, self.dynamics
+        left = settings.iterations(number, last) - self.num_timesteps
+        known = self.situations, self.dynamics, self._learned_reward
         with call.bar("Meta-learning", number, left, "it") as bar:
 
             def on_iteration(scalars: dict[str, float]) -> bool:
@@ -183,10 +183,11 @@ class SimulationLearner(ModelBasedAlgorithm):
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(self._draw_seed())  # initial weights come from torch's global generator
                 try:
+                    self.situations = transitions.situations
                     self._learn_model(transitions, Round(number, last, on_iteration, progress))
                     self._learn_reward(transitions)
                 except BaseException:
-                    self.dynamics = known  # half-learnt models are none
+                    self.situations, self.dynamics, self._learned_reward = known  # half-learnt models are none
                     raise
         return going_on
 

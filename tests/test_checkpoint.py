@@ -104,6 +104,32 @@ def test_settings_and_environment_can_be_changed(agent_file: Path, make_env: Mak
     assert agent.get_env().get_attr("situation")[0].label == "joint 3 dead"
 
 
+def test_seed_can_be_changed(agent_file: Path) -> None:
+    agents = [FAMLE.load(agent_file, device="cpu", seed=seed) for seed in (1, 1, 2)]
+    assert [agent.seed for agent in agents] == [1, 1, 2]
+    one, same, other = (actions(agent) for agent in agents)
+    assert np.array_equal(one, same)
+    assert not np.array_equal(one, other)
+
+
+def test_other_mode_is_refused(agent_file: Path) -> None:
+    with pytest.raises(ValueError, match="no other mode"):
+        FAMLE.load(agent_file, mode="paper")
+
+
+def test_robots_that_adapt_between_episodes_do_so_once_after_loading_too(
+    transitions: Transitions, make_env: MakeEnv, reload: Load
+) -> None:
+    settings = {"adapt_every": 0, "adapt_at_reset": True, "candidates": 5, "planner_iterations": 1}
+    agent = FAMLE(make_env(), seed=0, device="cpu", meta_iterations=2, **settings).meta_learn(transitions)
+    agent.learn(50 + 3)
+    agent.begin_episode()
+    assert agent.belief.adaptations == 2
+    copy = reload(agent)
+    copy.begin_episode()
+    assert copy.belief.adaptations == 2
+
+
 def test_horizon_can_be_changed_where_the_agent_has_a_plan(quick_agent: FAMLE, reload: Load) -> None:
     quick_agent.learn(2)
     loaded = reload(quick_agent, horizon=3, memory_size=7)

@@ -104,11 +104,14 @@ def test_steps_go_on_as_long_as_no_embedding_is_better(load: Load, data: Transit
     model, steps = agent._require_dynamics(), agent.hyperparameters.adaptation(0)
     tell(agent, data, [STRANGE], range(30))
     seen = memory(agent).seen
+    adaptations = 0
     for before, after, anew in after_each_adaptation(agent, data, [STRANGE], range(30, 39)):
+        adaptations += 1
         assert not anew.any()
         expected = descend(model, before, memory(agent), steps)
         torch.testing.assert_close(after.h, expected.h)
         torch.testing.assert_close(after.theta, expected.theta)
+    assert adaptations == 3
     assert memory(agent).seen == seen + 9
 
 

@@ -47,8 +47,47 @@ def test_learn_lives_and_adapts(quick_agent: FAMLE) -> None:
     assert recorder.calls == list(range(1, 61))
     assert recorder.ended
     assert quick_agent.num_timesteps == 60
-    assert quick_agent.belief.adaptations == 11  # 59 transitions: the one across the reset is none
+    assert quick_agent.belief.adaptations == 12
     assert max(quick_agent.posterior().items(), key=lambda item: item[1])[0] == "joint 3 dead"
+
+
+def test_callbacks_are_told_what_off_policy_algorithms_tell_them(quick_agent: FAMLE) -> None:
+    class Watcher(Recorder):
+        def _on_rollout_start(self) -> None:
+            self.calls.append(0)
+
+        def _on_rollout_end(self) -> None:
+            self.calls.append(-self.model.num_timesteps)
+            assert {"new_obs", "rewards", "dones", "infos"} <= set(self.locals)
+            assert self.locals["rewards"].shape == (1,)
+
+    watcher = Watcher()
+    quick_agent.learn(3, callback=watcher)
+    assert watcher.calls == [0, 1, -1, 0, 2, -2, 0, 3, -3]
+
+
+def test_robots_learn_from_the_last_transition_of_an_episode(quick_agent: FAMLE) -> None:
+    """Robots whose episodes end at different steps, each where it did not begin the next one."""
+    lengths = (3, 5)
+    quick_agent.get_env().close()
+    quick_agent.set_env(
+        DummyVecEnv([lambda n=n: gym.make("FamleReacher-v0", max_episode_steps=n) for n in lengths])  # type: ignore[misc]
+    )
+    ends: list[tuple[int, Any]] = []
+
+    def note(local: dict[str, Any], _: Any) -> bool:
+        ends.extend((i, info["terminal_observation"]) for i, info in enumerate(local["infos"]) if local["dones"][i])
+        return True
+
+    quick_agent.learn(2 * 6, callback=note)
+    memory = quick_agent._state_of(2).memory
+    assert memory.seen == 6
+    assert [i for i, _ in ends] == [0, 1, 0]
+    for (robot, terminal), age in zip(ends, (4, 2, 1), strict=True):
+        np.testing.assert_array_equal(memory.next_obs[robot, -age].numpy(), terminal)
+        if age > 1:
+            assert not torch.equal(memory.obs[robot, 1 - age], memory.next_obs[robot, -age])
+    quick_agent.get_env().close()
 
 
 def test_learning_goes_on_where_it_stopped(quick_agent: FAMLE) -> None:
@@ -161,6 +200,19 @@ def test_meta_learning_leaves_the_global_generators_alone(transitions: Transitio
     agent.meta_learn(transitions)
     agent.predict(some_observations(transitions, 1))
     assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_interrupted_meta_learning_leaves_the_agent_as_it_was(quick_agent: FAMLE) -> None:
+    situations, model, posterior = quick_agent.situations, quick_agent.dynamics, quick_agent.posterior()
+
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        quick_agent.meta_learn(["intact", "joint 1 dead"], callback=interrupt)
+    assert quick_agent.situations == situations
+    assert quick_agent.dynamics is model
+    assert quick_agent.posterior() == posterior
 
 
 def test_callback_counts_the_meta_iterations_and_stops_them(transitions: Transitions) -> None:

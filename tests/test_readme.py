@@ -24,9 +24,17 @@ def test_python_in_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_files_that_the_readme_names_are_there() -> None:
+    """Those without a folder are in that of the file before them."""
     text = (ROOT / "README.md").read_text()
-    for name in re.findall(r"`((?:famle_agent|famle_envs|benchmarks|tests)/[\w/.]+)`", text):
-        assert (ROOT / name).exists(), name
+    folder, named = ROOT, set[str]()
+    for name in re.findall(
+        r"`((?:(?:famle_agent|famle_envs|benchmarks|tests)/)?[\w/]+\.(?:py|md|yaml)|[\w/]+/)`", text
+    ):
+        path = ROOT / name if "/" in name or (ROOT / name).exists() else folder / name
+        assert path.exists(), name
+        named.add(path.name)
+        folder = path.parent
+    assert {"reacher.py", "planning.py", "lives.py", "NOTES.md"} <= named
 
 
 @pytest.mark.parametrize(
