@@ -23,7 +23,10 @@ from benchmarks.task import Task
 from famle_envs import Situation
 from famle_envs.reacher import ReacherEnv
 
-MODEL_BASED = ("famle", "famle-paper", "famle-original", "ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
+MODEL_BASED = (
+    *("famle", "famle-paper", "famle-paper-held", "famle-original"),
+    *("ampc", "ampc-reptile", "ampc-reptile-paper", "ampc-fomaml", "ampc-maml"),
+)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ class Look:
 LOOKS: Mapping[str, Look] = {
     "famle": Look("FAMLE", "#0072b2", paper="FAMLE"),
     "famle-paper": Look("FAMLE, the paper's settings", "#56b4e9", paper="FAMLE"),
+    "famle-paper-held": Look("FAMLE, the paper's settings on held actions", "#56b4e9", "-."),
     "famle-original": Look("FAMLE, the authors' code's settings", "#6f4fa2", paper="FAMLE"),
     "famle-anew": Look("FAMLE, anew at each adaptation", "#3f7fbf"),
     "famle-48": Look("FAMLE, 48 candidates", "#88aadd"),
@@ -47,6 +48,7 @@ LOOKS: Mapping[str, Look] = {
     "without-embeddings": Look("without embeddings", "#b8860b"),
     "ampc": Look("AMPC", "#8c510a", paper="AMPC"),
     "ampc-reptile": Look("AMPC-MAML (Reptile)", "#e69f00", paper="AMPC-MAML"),
+    "ampc-reptile-paper": Look("AMPC-MAML (Reptile), the paper's settings", "#e69f00", "-."),
     "ampc-fomaml": Look("AMPC-MAML (first order)", "#f0675c", paper="AMPC-MAML"),
     "ampc-maml": Look("AMPC-MAML (second order)", "#b2182b", paper="AMPC-MAML"),
     "ppo": Look("PPO", "#e07bb5", paper="PPO"),
