@@ -25,7 +25,7 @@ import tyro
 from benchmarks import curves
 from benchmarks.compare import compare
 from benchmarks.harness import Options, Result
-from benchmarks.methods import METHODS, PPO_METHODS, Method, famle, from_cache
+from benchmarks.methods import METHODS, PPO_METHODS, Method, famle, from_cache, settings_of
 from benchmarks.reporting.report import show
 from benchmarks.task import Task
 from famle_agent import FAMLE, FAMLEWrapper, ModelBasedAgent
@@ -179,7 +179,7 @@ def run(method: str, task: Task, args: Args) -> Result:
         env.get_wrapper_attr("set_situation")(task.situation)
     result = run_and_break(env, task.situation, args.steps, break_at, task.seed)
     env.close()
-    return _result(result, task.situation)
+    return _result(result, task.situation) | {"settings": settings_of(agent)}
 
 
 def run_fleet(method: str, tasks: Sequence[Task], args: Args) -> list[Result]:

@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from benchmarks.harness import Result
 from benchmarks.lives import History, Repeatable, read_life, write_life
+from benchmarks.methods import settings_of
 from benchmarks.task import Task
 from famle_agent import ModelBasedAgent
 
@@ -55,7 +56,8 @@ def run(
     if (missing := steps - history.steps) > 0:
         agent.learn(missing * len(envs), callback=historian)
     vec_env.close()
-    return [_result(task, historian.history, i, steps) for i, task in enumerate(tasks)]
+    settings = {"settings": settings_of(agent)}
+    return [_result(task, historian.history, i, steps) | settings for i, task in enumerate(tasks)]
 
 
 class _Historian(BaseCallback):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.harness import Result
-from benchmarks.methods import METHODS
+from benchmarks.methods import METHODS, settings_of
 from benchmarks.task import Task
 from famle_agent import FAMLEWrapper, ModelBasedAgent
 from famle_agent.journey import run_journey
@@ -29,6 +29,7 @@ def run(method: str, task: Task) -> Result:
         "situation": str(task.situation),
         "later": None if task.later is None else str(task.later),
         "profile": profile,
+        "settings": settings_of(agent),
         "gaits": journey.gaits,
         "reached": journey.reached,
         "fell": journey.fell,

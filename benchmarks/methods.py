@@ -5,7 +5,9 @@ A method is one entry of :data:`METHODS`; every benchmark takes its agents from 
 
 from __future__ import annotations
 
+import json
 import shutil
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -24,7 +26,7 @@ from famle_agent.policies import make_held_uniform
 from famle_agent.robots import known_robots
 from famle_agent.transitions import collect
 
-__all__ = ["METHODS", "PPO_METHODS", "Method", "famle", "from_cache", "shipped"]
+__all__ = ["METHODS", "PPO_METHODS", "Method", "famle", "from_cache", "settings_of", "shipped"]
 
 Agent = TypeVar("Agent", bound=ModelBasedAgent)
 
@@ -55,6 +57,17 @@ class Method:
         if self.fleet is None:
             raise ValueError(f"The replicates of this method run one by one, not {len(tasks)} in step.")
         return self.fleet(tasks)
+
+
+def settings_of(agent: BaseAlgorithm) -> str:
+    """A short name of all of an agent's settings; empty for an agent that is not ours.
+
+    Results keep it, so that a method whose settings were changed between its replicates can be told.
+    """
+    if not isinstance(agent, ModelBasedAgent):
+        return ""
+    settings = json.dumps(agent.hyperparameters.to_dict(), sort_keys=True)
+    return f"{zlib.crc32(settings.encode()):08x}"
 
 
 # --- FAMLE ------------------------------------------------------------------------------------------------------------

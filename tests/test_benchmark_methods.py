@@ -11,7 +11,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from benchmarks import curves, methods, reacher
-from benchmarks.methods import METHODS, PPO_METHODS, MetaTrained
+from benchmarks.methods import METHODS, PPO_METHODS, MetaTrained, settings_of
 from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent, simulation
 from famle_agent.progress import Progress
 from famle_agent.robots import known_robots
@@ -98,6 +98,18 @@ def test_methods_differ_by_their_settings(method: str, expected: dict[str, Any],
     assert {name: getattr(settings, name) for name in expected} == expected
     assert settings.members == agent._require_dynamics().members == 1
     agent.get_env().close()
+
+
+def test_results_tell_settings_apart(cache: Path) -> None:
+    one, same, other, rival, model_free = (
+        settings_of(METHODS[method].agent(task_of(seed, cache)))
+        for method, seed in (("famle", 0), ("famle", 1), ("famle-frozen", 0), ("ampc", 0), ("ppo", 0))
+    )
+    assert one == same
+    assert len({one, other, rival, model_free}) == 4
+    task = task_of(0, cache)
+    (result,) = curves.run(METHODS["famle"].agent(task), [task], EPISODE)
+    assert result["settings"] == one
 
 
 def test_every_benchmark_knows_its_methods() -> None:

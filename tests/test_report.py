@@ -313,6 +313,15 @@ def test_fewer_replicates_than_others_or_the_paper_are_said_in_the_title(arm: Pa
     assert "2 replicates, the paper has 30; 1 of AMPC" in title
 
 
+def test_replicates_of_different_settings_are_said_in_the_title(results: Path) -> None:
+    for method, settings in (("famle", ("aa", "aa", "bb")), ("ampc", ("cc", "cc", "cc"))):
+        for seed, name in enumerate(settings):
+            store_run(results, method, seed, 100.0, settings=name)
+    store_run(results, "ppo", 0, 1.0)  # of a time when nobody kept them
+    title = next(line for line in report(results)[0].splitlines() if line.startswith("## Ant"))
+    assert title.endswith("settings that differ between replicates of FAMLE")
+
+
 def test_oracle_is_compared_over_the_seeds_that_both_have(ant: Path) -> None:
     store_runs(ant, "oracle", [4000.0])
     text, out = report(ant)

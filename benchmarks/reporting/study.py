@@ -174,6 +174,8 @@ class Study:
                 parts.append(f"{self.steps:,} robot steps instead of {self.experiment.budget:,}")
             short = {method: steps for method, steps in self.lived.items() if steps < self.steps}
             parts += [f"{steps:,} robot steps of {look(method).label}" for method, steps in short.items()]
+        if mixed := [look(method).label for method, runs in self.runs.items() if _settings_differ(runs)]:
+            parts.append("settings that differ between replicates of " + " / ".join(mixed))
         return f"{self.experiment.title}: {'; '.join(parts)}"
 
     @property
@@ -199,6 +201,11 @@ class Study:
         """The return since the damage, as if that had lasted for the whole episode."""
         budget = self.experiment.budget
         return float(run["return"] * budget / (budget - run.get("break_at", 0)))
+
+
+def _settings_differ(runs: Sequence[Result]) -> bool:
+    """Whether replicates of a method are of agents with different settings, as far as results know of them."""
+    return len({run["settings"] for run in runs if "settings" in run}) > 1
 
 
 def quartiles_over_steps(traces: Sequence[tuple[Array, Array]], hold: bool = False) -> tuple[Array, Array]:
