@@ -126,7 +126,7 @@ class SimulationLearner(ModelBasedAlgorithm):
         """
         source = envs if isinstance(envs, Transitions) else situation_envs(self._require_env(), envs)
         rounds = 0 if isinstance(source, Transitions) else self.hyperparameters.rounds
-        run = RunFolder(folder, self._fingerprint(source))
+        run = RunFolder(folder, {} if folder is None else self._fingerprint(source))  # which reads all transitions
         if not self._custom_logger:
             name = tb_log_name or f"{type(self).__name__}_meta"
             self._logger = configure_logger(self.verbose, self.tensorboard_log, name)

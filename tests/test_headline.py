@@ -8,7 +8,7 @@ from benchmarks.reporting.headline import headline, insert
 from benchmarks.reporting.registry import EXPERIMENTS
 from benchmarks.reporting.report import Report
 from benchmarks.reporting.study import Study, read_study
-from tests.test_report import store_curves, store_gaits
+from tests.stored_results import store_curves, store_gaits
 
 ROOT = Path(__file__).parent.parent
 

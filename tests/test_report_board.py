@@ -10,7 +10,7 @@ from tensorboard.plugins.hparams import plugin_data_pb2
 
 from benchmarks.reporting.board import METRICS
 from benchmarks.reporting.report import Report
-from tests.test_report import store_curves, store_gaits, store_runs
+from tests.stored_results import store_curves, store_gaits, store_runs
 
 
 @pytest.fixture(scope="module")

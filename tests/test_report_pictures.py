@@ -10,7 +10,7 @@ from benchmarks.reporting.pictures import draw, draw_times
 from benchmarks.reporting.registry import EXPERIMENTS, Experiment
 from benchmarks.reporting.study import Study, read_study
 from benchmarks.reporting.tables import figures
-from tests.test_report import store, store_curves, store_gaits, store_runs, store_walks
+from tests.stored_results import store, store_curves, store_gaits, store_runs, store_walks
 
 BY_FOLDER = {experiment.folder: experiment for experiment in EXPERIMENTS}
 

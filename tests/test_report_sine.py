@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from benchmarks.reporting.report import Report
-from tests.test_report import report, rows_of, store_curves
+from tests.stored_results import report, rows_of, store_curves
 
 STORED: dict[str, Any] = {
     "title": "Mean squared error over x, 2 replicates of 5 unseen sines",
