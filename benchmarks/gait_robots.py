@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from benchmarks.harness import Result
-from benchmarks.methods import METHODS, settings_of
+from benchmarks.methods import METHODS, Method, settings_of
 from benchmarks.task import Task
 from famle_agent import FAMLEWrapper, ModelBasedAgent
 from famle_agent.journey import run_journey
@@ -13,9 +15,9 @@ from famle_agent.journey import run_journey
 __all__ = ["run"]
 
 
-def run(method: str, task: Task) -> Result:
+def run(method: str, task: Task, known: Mapping[str, Method] = METHODS) -> Result:
     """One replicate: an episode of the test robot."""
-    agent = METHODS[method].agent(task)
+    agent = known[method].agent(task)
     if not isinstance(agent, ModelBasedAgent):
         raise ValueError(
             f"{method} needs more steps than an episode of the {task.robot} has; take a model-based method."

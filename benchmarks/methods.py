@@ -26,7 +26,17 @@ from famle_agent.policies import make_held_uniform
 from famle_agent.robots import known_robots
 from famle_agent.transitions import collect
 
-__all__ = ["METHODS", "PPO_METHODS", "Method", "famle", "from_cache", "settings_of", "shipped"]
+__all__ = [
+    "META_TRAINED",
+    "METHODS",
+    "PPO_METHODS",
+    "MetaTrained",
+    "Method",
+    "famle",
+    "from_cache",
+    "settings_of",
+    "shipped",
+]
 
 Agent = TypeVar("Agent", bound=ModelBasedAgent)
 
@@ -153,6 +163,7 @@ class MetaTrained:
         cls: The kind of agent.
         mode: Of its settings.
         networks: Replicate i has network i, counted round.
+        in_step: Whether many replicates can act in step.
         settings: Settings to change.
     """
 
@@ -160,7 +171,12 @@ class MetaTrained:
     cls: type[ModelBasedAgent]
     mode: str = "ours"
     networks: int = 10
+    in_step: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def method(self) -> Method:
+        """How this agent comes to be."""
+        return Method(self.agent, self.learn, self.fleet if self.in_step else None)
 
     def agent(self, task: Task) -> ModelBasedAgent:
         """The agent of a replicate."""
@@ -234,17 +250,17 @@ def _simulated_data(task: Task) -> Transitions:
 # --- what they are called ---------------------------------------------------------------------------------------------
 
 
-def _meta_trained(
-    name: str,
-    cls: type[ModelBasedAgent],
-    mode: str = "ours",
-    networks: int = 10,
-    in_step: bool = False,
-    **settings: Any,
-) -> Method:
-    recipe = MetaTrained(name, cls, mode, networks, settings)
-    return Method(recipe.agent, recipe.learn, recipe.fleet if in_step else None)
-
+META_TRAINED: dict[str, MetaTrained] = {
+    "famle-paper": MetaTrained("paper", FAMLE, "paper"),
+    "famle-paper-held": MetaTrained("paper-held", FAMLE, "paper", settings={"action_hold": 5}),
+    "famle-original": MetaTrained("original", FAMLE, "original"),
+    "ampc": MetaTrained("ampc", AMPC, networks=30, in_step=True),
+    "ampc-reptile": MetaTrained("reptile", AMPCMAML, in_step=True, settings={"meta_learner": "reptile"}),
+    "ampc-reptile-paper": MetaTrained("paper-reptile", AMPCMAML, "paper", settings={"meta_learner": "reptile"}),
+    "ampc-fomaml": MetaTrained("fomaml", AMPCMAML, in_step=True, settings={"meta_learner": "first-order-maml"}),
+    "ampc-maml": MetaTrained("maml", AMPCMAML, in_step=True, settings={"meta_learner": "maml"}),
+}
+"""Those whose meta-training the package does not ship, by name."""
 
 METHODS: dict[str, Method] = {
     "famle": Method(famle),
@@ -253,14 +269,7 @@ METHODS: dict[str, Method] = {
     "famle-select": Method(partial(famle, adapt_steps=0)),
     "famle-likeliest": Method(partial(famle, spread_members=False)),
     "famle-nearest": Method(partial(famle, adapt_steps=0, compose=False, spread_members=False)),
-    "famle-paper": _meta_trained("paper", FAMLE, "paper"),
-    "famle-paper-held": _meta_trained("paper-held", FAMLE, "paper", action_hold=5),
-    "famle-original": _meta_trained("original", FAMLE, "original"),
-    "ampc": _meta_trained("ampc", AMPC, networks=30, in_step=True),
-    "ampc-reptile": _meta_trained("reptile", AMPCMAML, in_step=True, meta_learner="reptile"),
-    "ampc-reptile-paper": _meta_trained("paper-reptile", AMPCMAML, "paper", meta_learner="reptile"),
-    "ampc-fomaml": _meta_trained("fomaml", AMPCMAML, in_step=True, meta_learner="first-order-maml"),
-    "ampc-maml": _meta_trained("maml", AMPCMAML, in_step=True, meta_learner="maml"),
+    **{name: recipe.method() for name, recipe in META_TRAINED.items()},
     "ppo": Method(ppo.from_scratch),
     "ppo-pretrained": Method(ppo.simulated_first, ppo.learn_simulated),
     "oracle": Method(oracle),

@@ -11,6 +11,7 @@ import gymnasium as gym
 import famle_envs  # noqa: F401 (registers the robots)
 from famle_agent.robots import known_robots
 from famle_envs import Situation
+from famle_envs.reality import Profile
 
 __all__ = ["Task"]
 
@@ -33,7 +34,7 @@ class Task:
     seed: int
     situation: Situation
     cache: Path
-    profile: str = ""
+    profile: str | Profile = ""
     later: Situation | None = None
     strikes_at: int = 0
 

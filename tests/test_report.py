@@ -134,14 +134,20 @@ def test_method_with_fewer_steps_is_compared_by_what_it_has(arm: Path) -> None:
 
 
 def test_episode_says_which_robots_walk_again(ant: Path) -> None:
-    for seed, steps in enumerate((100, 300, None)):
+    for seed, steps in enumerate((0, 100, 300, None)):
         path = ant / "ant-unseen" / f"famle-{seed}.json"
         stored = json.loads((ant / "ant-unseen" / "famle-0.json").read_text())
         path.write_text(json.dumps(stored | {"seed": seed, "recovery": steps, "break_at": 300}))
     text, out = report(ant)
     row = by_name(out / "ant-unseen.csv")["famle"]
-    assert (row["recovered"], row["recovery"]) == ("2", "300.0")
-    assert rows_of(text, "FAMLE")[0][3:5] == ["2 of 3", "300"]
+    walking = ("walks_on", "recovered", "recovery", "slowest_recovery")
+    assert [row[name] for name in walking] == ["1", "3", "200.0", "300"]
+    assert rows_of(text, "FAMLE")[0][3:7] == ["1 of 4", "3 of 4", "200", "300"]
+
+
+def test_robot_that_was_broken_from_the_first_step_does_not_walk_on(ant: Path) -> None:
+    text, _ = report(ant)
+    assert rows_of(text, "FAMLE")[0][3] == "-"
 
 
 def test_benchmark_shows_the_section_of_its_experiment(ant: Path, capsys: pytest.CaptureFixture[str]) -> None:

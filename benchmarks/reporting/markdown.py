@@ -92,8 +92,9 @@ over all steps of a method. An episode is the resolution of all of these: where 
 *faster by* counts episodes. Returns are those of the life itself, PPO's with the noise by which it explores. The time
 of a step contains the simulated robot and all learning on the way.""",
     "episode": """A robot walks again as soon as its mean speed over 100 steps is above 0.8 m/s, the paper's solved
-mark; the steps since the damage are a median, in which one that never does is infinite. The time is the median of a
-control step, with adaptation.""",
+mark; the steps since the damage are a median, in which one that never does is infinite, and those of the slowest that
+does. Where the damage strikes on the way, one whose mean speed never falls to the mark walks on, after 0 steps. The
+time is the median of a control step, with adaptation.""",
     "gaits": """Steps are the gaits of the runs that reach the goal, within {study.experiment.budget}. A gait takes a
 second; the paper's took about two. *FAMLE faster by* compares the means of these. The time of a plan is without
 adaptation.""",
@@ -135,8 +136,10 @@ def _times(study: Study) -> list[Column]:
 def _episode(study: Study) -> list[Column]:
     return [
         (f"above {study.experiment.threshold:g}", lambda row: _count(row, "solved")),
+        ("walks on", lambda row: _count(row, "walks_on")),
         ("walks again", lambda row: _count(row, "recovered")),
         ("after steps", lambda row: _steps(row.get("recovery"))),
+        ("the slowest of them", lambda row: _steps(row.get("slowest_recovery"))),
         *_times(study),
     ]
 

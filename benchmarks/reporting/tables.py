@@ -140,11 +140,15 @@ def _curves(study: Study, method: str) -> Row:
 def _episode(study: Study, method: str) -> Row:
     runs = study.runs[method]
     recovery = [run.get("recovery") for run in runs]
-    return {
+    row: Row = {
         "solved": int(np.sum(study.scores(method, study.measures[0]) > study.experiment.threshold)),
         "recovered": sum(steps is not None for steps in recovery),
         "recovery": median_steps(recovery),
+        "slowest_recovery": max((steps for steps in recovery if steps is not None), default=None),
     }
+    if any(run.get("break_at") for run in runs):
+        row["walks_on"] = sum(steps == 0 for steps in recovery)
+    return row
 
 
 def _gaits(study: Study, method: str) -> Row:

@@ -1,0 +1,206 @@
+"""One setting of an agent that is meta-trained for the benchmark, at several values, on robots that no result is of.
+
+python -m benchmarks.tuning --robot quadruped --methods ampc-maml --setting inner_lr --values 0.01 0.03 0.1
+python -m benchmarks.tuning --robot ant --methods ampc --setting adapt_lr --values 1e-3 3e-3 --replicates 3 --steps 5000
+
+The robots are drawn like those of the tests, with seeds of their own. Prints the mean of each value and its replicates:
+gaits to the goal (one more than there are where it is not reached), metres, or the return of an episode.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import tyro
+
+from benchmarks import curves, gait_robots
+from benchmarks.compare import compare
+from benchmarks.harness import Options, Result, load_results
+from benchmarks.methods import META_TRAINED, Method
+from benchmarks.reporting.registry import experiment_in
+from benchmarks.task import Task
+from famle_envs import Situation
+from famle_envs.ant import AntEnv
+from famle_envs.quadruped import LEGS, blocked_leg
+from famle_envs.reacher import ReacherEnv
+from famle_envs.reality import Profile
+
+YAW = math.radians(40)
+
+
+@dataclass(frozen=True)
+class Args(Options):
+    """One setting of an agent at several values, on robots that no result is of."""
+
+    robot: Literal["reacher", "ant", "quadruped", "minitaur"] = "quadruped"
+    """The robot."""
+    methods: tuple[str, ...] = ("ampc-maml",)
+    """Entries of benchmarks.methods.META_TRAINED."""
+    setting: str = "inner_lr"
+    """One of the fields of famle_agent.hyperparameters.Hyperparameters."""
+    values: tuple[str, ...] = ("0.01", "0.03", "0.1")
+    """What it is set to, as in JSON."""
+    replicates: int = 9
+    """Robots 0, 1, ..."""
+    steps: int = 500
+    """Robot steps of an arm or an ant."""
+    out: Path = Path("runs/tuning")
+    """Folder of the results."""
+
+
+def main(args: Args) -> None:
+    """Runs and prints.
+
+    Raises:
+        ValueError: The method is not meta-trained for the benchmark, or a value is not one of JSON.
+    """
+    robot = ROBOTS[args.robot]
+    tasks = [robot.task(i, args.cache) for i in range(args.replicates)]
+    known = {
+        f"{name}-{args.setting}={value}": method_with(name, args.setting, value)
+        for name in args.methods
+        for value in args.values
+    }
+    if robot.lives:
+        folder = args.out / f"{args.robot}-{args.steps}"
+        run, fleets = partial(_live_alone, args=args, known=known), partial(_live, args=args, known=known)
+        compare(list(known), tasks, run, folder, args, known, fleets)
+    else:
+        folder = args.out / args.robot
+        compare(list(known), tasks, partial(gait_robots.run, known=known), folder, args, known)
+    results = load_results(folder)
+    for name in known:
+        scores = [robot.score(result) for result in results if result["method"] == name][: args.replicates]
+        print(f"{args.robot}, {name}: {np.mean(scores):.1f} of", *(f"{score:.1f}" for score in scores))
+
+
+def method_with(name: str, setting: str, value: str) -> Method:
+    """A method with one setting changed, and a model of its own.
+
+    Args:
+        name: Of an agent that is meta-trained for the benchmark.
+        setting: One of its hyperparameters.
+        value: In JSON.
+
+    Raises:
+        ValueError: There is no such agent, or the value is not JSON.
+    """
+    if name not in META_TRAINED:
+        raise ValueError(f"{name!r} is not meta-trained for the benchmark. Those that are: {', '.join(META_TRAINED)}.")
+    recipe = META_TRAINED[name]
+    settings = {**recipe.settings, setting: json.loads(value)}
+    return replace(recipe, name=f"{recipe.name}-{setting}={value}", settings=settings).method()
+
+
+def _live(method: str, tasks: Sequence[Task], args: Args, known: Mapping[str, Method]) -> list[Result]:
+    life = args.life(f"tuning-{args.robot}", method, [task.seed for task in tasks])
+    return curves.run(known[method].on(tasks), tasks, args.steps, life)
+
+
+def _live_alone(method: str, task: Task, args: Args, known: Mapping[str, Method]) -> Result:
+    return _live(method, [task], args, known)[0]
+
+
+# --- the robots -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Robot:
+    """Robots to tune on.
+
+    Attributes:
+        task: Makes robot i, of a folder of agents.
+        score: What a replicate is judged by.
+        lives: Whether it goes through episodes one after the other.
+    """
+
+    task: Callable[[int, Path], Task]
+    score: Callable[[Result], float]
+    lives: bool = False
+
+
+def _arm(i: int, cache: Path) -> Task:
+    return Task("reacher", i, ReacherEnv.sample_situation(np.random.default_rng([7, i]), n_faults=2), cache)
+
+
+def _ant(i: int, cache: Path) -> Task:
+    return Task("ant", i, AntEnv.sample_situation(np.random.default_rng([7, i])), cache)
+
+
+def _quadruped(i: int, cache: Path) -> Task:
+    """A yaw error, a blocked leg and both, on one body after the other."""
+    body, wrong = divmod(i, 3)
+    locked = blocked_leg(body % len(LEGS)).locked_joints if wrong else ()
+    yaw = 0.0 if wrong == 1 else YAW
+    u = np.random.default_rng([5, body])
+    profile = Profile(
+        name=f"drawn {body}",
+        motor_strength=u.uniform(0.025, 0.05),
+        motor_speed=u.uniform(0.35, 0.7),
+        joint_damping=0.02,
+        zero_errors=tuple(u.normal(0.0, 0.1, 12)),
+        backlash=u.uniform(0.0, 0.04),
+        latency=u.uniform(0.0, 0.06),
+        base_mass=u.uniform(1.0, 1.5),
+        leg_mass=u.uniform(0.9, 1.2),
+        floor_friction=u.uniform(0.35, 0.8),
+        contact_stiffness=u.uniform(4000.0, 9000.0),
+        contact_damping=50.0,
+        position_noise=0.01,
+        orientation_noise=0.03,
+    )
+    return Task("quadruped", i, Situation(locked_joints=locked, orientation_error=yaw), cache, profile)
+
+
+def _minitaur(i: int, cache: Path) -> Task:
+    """Intact, each with a body of its own."""
+    u = np.random.default_rng([5, i])
+    profile = Profile(
+        name=f"drawn {i}",
+        motor_strength=u.uniform(0.55, 0.9),
+        motor_speed=u.uniform(0.7, 1.0),
+        joint_damping=0.02,
+        zero_errors=tuple(u.normal(0.0, 0.06, 8)),
+        backlash=u.uniform(0.0, 0.03),
+        latency=u.uniform(0.0, 0.04),
+        base_mass=u.uniform(1.0, 1.4),
+        leg_mass=u.uniform(0.9, 1.2),
+        floor_friction=u.uniform(0.35, 0.8),
+        contact_stiffness=u.uniform(8000.0, 15_000.0),
+        contact_damping=100.0,
+        position_noise=0.01,
+        orientation_noise=0.02,
+    )
+    return Task("minitaur", i, Situation(), cache, profile)
+
+
+def _mean_return(result: Result) -> float:
+    return float(np.mean(result["returns"]))
+
+
+def _gaits(result: Result) -> float:
+    return float(result["gaits"] if result["reached"] else experiment_in("quadruped-yaw").budget + 1)
+
+
+def _metres(result: Result) -> float:
+    return float(result["distance"])
+
+
+ROBOTS: Mapping[str, Robot] = {
+    "reacher": Robot(_arm, _mean_return, lives=True),
+    "ant": Robot(_ant, _mean_return, lives=True),
+    "quadruped": Robot(_quadruped, _gaits),
+    "minitaur": Robot(_minitaur, _metres),
+}
+"""By name."""
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
