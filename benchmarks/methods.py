@@ -36,6 +36,7 @@ __all__ = [
     "from_cache",
     "settings_of",
     "shipped",
+    "simulated_data",
 ]
 
 Agent = TypeVar("Agent", bound=ModelBasedAgent)
@@ -221,14 +222,14 @@ class MetaTrained:
         return agent
 
     def _learn(self, agent: ModelBasedAgent, task: Task, folder: Path) -> None:
-        data = _simulated_data(task) if self.mode == "ours" else None
+        data = simulated_data(task) if self.mode == "ours" else None
         agent.meta_learn(data, progress_bar=True, n_jobs=-1, folder=folder)
 
     def _new(self, robot: str, seed: int, **more: Any) -> ModelBasedAgent:
         return self.cls(robot, self.mode, seed=seed, device="cpu", pretrained=False, **{**self.settings, **more})
 
 
-def _simulated_data(task: Task) -> Transitions:
+def simulated_data(task: Task) -> Transitions:
     """As many transitions of each situation as FAMLE's model has seen, collected once for all methods.
 
     Where FAMLE goes round, its planned transitions come from that very model: its own rounds began with a poor one,

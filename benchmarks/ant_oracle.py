@@ -1,0 +1,75 @@
+"""The ant's upper line: a model that knows the very test robot as one situation more.
+
+A model of that robot alone is none, however much it has seen of it: what legs and floor do is the same in all
+situations. The shipped model learns one round on, from the transitions of its own situations and as many of the test
+robot's; then it is told which of them it is in.
+"""
+
+from __future__ import annotations
+
+import copy
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.methods import from_cache, shipped, simulated_data
+from benchmarks.task import Task
+from famle_agent import FAMLE, Transitions
+from famle_agent.dynamics import Dynamics
+from famle_agent.policies import make_held_uniform
+from famle_agent.transitions import collect
+
+__all__ = ["ant_oracle"]
+
+_IDENTIFIES = 300  # steps, after which FAMLE is sure of its embedding
+
+
+def ant_oracle(task: Task) -> FAMLE:
+    """FAMLE with one situation, the test robot's."""
+    agent = FAMLE(task.robot, seed=task.seed, device="cpu", pretrained=False, compose=False)
+    broken = str(task.situation).replace(" ", "_")
+    return from_cache(agent, task.cache / f"{task.robot}-knows-{broken}.zip", partial(_learn_on, task=task))
+
+
+def _learn_on(agent: FAMLE, task: Task) -> None:
+    others, (model, h) = simulated_data(task), _as_famle_begins(task)
+    agent.situations, agent.dynamics = (task.situation.label,), _with_embeddings(model, h)
+    own = _of_the_test_robot(agent, task, others.obs.shape[1])
+
+    agent.dynamics = _with_embeddings(model, torch.cat([model.embeddings.detach(), h], dim=1))
+    known, data = agent._begin_model(agent._in_model_units(_beside(others, own)), round_=1)
+    agent.hyperparameters.joint_training(1)(known, data, agent._generator)
+    known.fit_noise(data)
+    agent.dynamics = _with_embeddings(known, known.embeddings.detach()[:, -1:])
+
+
+def _as_famle_begins(task: Task) -> tuple[Dynamics, Tensor]:
+    """The shipped model, and the embedding that FAMLE takes for the test robot's, (P, 1, embedding_dim)."""
+    agent = shipped(task.robot, task.seed)
+    agent.set_env(task.make())
+    agent.learn(_IDENTIFIES)
+    return agent._require_dynamics(), agent.belief.h[:, None]
+
+
+def _of_the_test_robot(agent: FAMLE, task: Task, n: int) -> Transitions:
+    """As many transitions, of which the agent plans as large a part as of its training situations."""
+    settings, robot, name = agent.hyperparameters, [task.make], agent.situations
+    planned = settings.rounds * settings.round_transitions
+    planned = n * planned // (settings.transitions_per_situation + planned)
+    random = collect(robot, name, n - planned, make_held_uniform(settings.action_hold), seed=0)
+    return random.followed_by(collect(robot, name, planned, agent._planning(), seed=1))
+
+
+def _beside(some: Transitions, others: Transitions) -> Transitions:
+    """Transitions of more situations."""
+    names = ("obs", "action", "reward", "next_obs")
+    arrays = {name: np.concatenate([getattr(some, name), getattr(others, name)]) for name in names}
+    return Transitions(**arrays, situations=(*some.situations, *others.situations))
+
+
+def _with_embeddings(model: Dynamics, embeddings: Tensor) -> Dynamics:
+    model = copy.deepcopy(model)
+    model.embeddings = torch.nn.Parameter(embeddings.clone())
+    return model
