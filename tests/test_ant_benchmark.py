@@ -13,6 +13,7 @@ from benchmarks.harness import Replicate, load_results, run_replicates
 from benchmarks.reporting.looks import look
 from benchmarks.reporting.report import show
 from benchmarks.task import Task
+from famle_agent import ModelBasedAgent
 from famle_agent.adaptation import Candidates
 from famle_envs.ant import AntEnv
 from tests.helpers import simple_model
@@ -58,6 +59,16 @@ def test_methods_are_the_shipped_agent_with_something_changed(method: str) -> No
     assert settings.compose == (method != "famle-nearest")
     assert bool(settings.adapt_steps) == (method == "famle-theta")
     assert settings.planner == ("random_shooting" if method == "random-shooting" else "icem")
+    agent.get_env().close()
+
+
+def test_stored_network_is_the_one_that_its_method_would_learn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ModelBasedAgent, "meta_learn", None)  # an hour
+    stored = Path(__file__).parents[1] / "benchmarks" / "agents"
+    agent: Any = ANT_METHODS["famle-original"].agent(Task("ant", 0, damage_of("curves", 0), stored))
+    assert agent.situations == tuple(situation.label for situation in AntEnv.training_situations)
+    obs, _ = agent.get_env().envs[0].reset(seed=0)
+    assert agent.predict(obs)[0].shape == (8,)
     agent.get_env().close()
 
 
