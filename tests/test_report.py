@@ -120,6 +120,8 @@ def test_curves_are_compared_over_the_steps_that_all_have_and_long_budgets_are_t
 
 def test_method_with_fewer_steps_is_compared_by_what_it_has(arm: Path) -> None:
     store_curves(arm, "famle-paper", [[10.0, 35.0]] * 2)
+    store_curves(arm, "famle-original", [[10.0, 35.0]] * 2)
+    store_curves(arm, "ampc", [[10.0]] * 2)
     text, out = report(arm)
     row = by_name(out / "reacher-paper.csv")["famle-paper"]
     assert (row["robot_steps"], row["first_episode_median"], row["first_episode_famle_better"]) == (
@@ -129,7 +131,8 @@ def test_method_with_fewer_steps_is_compared_by_what_it_has(arm: Path) -> None:
     )
     compared = ("mean_return_median", "last_median", "mean_return_famle_better", "solved_in_common_steps")
     assert [row[name] for name in compared] == [""] * 4
-    assert "100 robot steps of FAMLE, the paper's settings" in text
+    alike = "100 robot steps of FAMLE, the paper's settings / FAMLE, the authors' code's settings"
+    assert f"{alike}; 50 robot steps of AMPC\n" in text
     assert "mean return over 200 robot steps" in text
 
 

@@ -166,14 +166,13 @@ class Study:
         parts = [f"{most} replicates"]
         if most < self.experiment.paper_replicates:
             parts[0] += f", the paper has {self.experiment.paper_replicates}"
-        for fewer in sorted({n for n in counts.values() if n < most}, reverse=True):
-            parts.append(f"{fewer} of " + " / ".join(look(method).label for method, n in counts.items() if n == fewer))
+        parts += [f"{n} of {labels}" for n, labels in _by_number({m: n for m, n in counts.items() if n < most})]
         if self.experiment.kind == "curves":
             longest = max(max(run["lengths"]) for runs in self.runs.values() for run in runs)
             if self.steps + longest <= self.experiment.budget:
                 parts.append(f"{self.steps:,} robot steps instead of {self.experiment.budget:,}")
-            short = {method: steps for method, steps in self.lived.items() if steps < self.steps}
-            parts += [f"{steps:,} robot steps of {look(method).label}" for method, steps in short.items()]
+            short = _by_number({method: steps for method, steps in self.lived.items() if steps < self.steps})
+            parts += [f"{steps:,} robot steps of {labels}" for steps, labels in short]
         if mixed := [look(method).label for method, runs in self.runs.items() if _settings_differ(runs)]:
             parts.append("settings that differ between replicates of " + " / ".join(mixed))
         return f"{self.experiment.title}: {'; '.join(parts)}"
@@ -201,6 +200,14 @@ class Study:
         """The return since the damage, as if that had lasted for the whole episode."""
         budget = self.experiment.budget
         return float(run["return"] * budget / (budget - run.get("break_at", 0)))
+
+
+def _by_number(numbers: Mapping[str, int]) -> list[tuple[int, str]]:
+    """The labels of the methods that have a number, for each number, the largest first."""
+    labels: dict[int, list[str]] = {}
+    for method, number in numbers.items():
+        labels.setdefault(number, []).append(look(method).label)
+    return [(number, " / ".join(labels[number])) for number in sorted(labels, reverse=True)]
 
 
 def _settings_differ(runs: Sequence[Result]) -> bool:
