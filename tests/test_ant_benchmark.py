@@ -62,10 +62,11 @@ def test_methods_are_the_shipped_agent_with_something_changed(method: str) -> No
     agent.get_env().close()
 
 
-def test_stored_network_is_the_one_that_its_method_would_learn(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("method", ["famle-original", "famle-paper"])
+def test_stored_network_is_the_one_that_its_method_would_learn(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ModelBasedAgent, "meta_learn", None)  # it would take most of an hour
     stored = Path(__file__).parents[1] / "benchmarks" / "agents"
-    agent: Any = ANT_METHODS["famle-original"].agent(Task("ant", 0, damage_of("curves", 0), stored))
+    agent: Any = ANT_METHODS[method].agent(Task("ant", 0, damage_of("curves", 0), stored))
     assert agent.situations == tuple(situation.label for situation in AntEnv.training_situations)
     obs, _ = agent.get_env().envs[0].reset(seed=0)
     assert agent.predict(obs)[0].shape == (8,)
