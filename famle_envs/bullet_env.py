@@ -212,6 +212,15 @@ class BulletEnv(gym.Env[Array, Array]):
                 pybullet.disconnect(physicsClientId=self._client)
             self._client = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_obs": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # A copy has a world of its own, in which it has not been reset: the number of this one may be anybody's there.
+        vars(self).update(state | {"_client": None})
+        if state["_client"] is not None:
+            self._load()
+
     def __del__(self) -> None:
         # A world that nobody closes would keep its memory until the process ends.
         if getattr(self, "_client", None) is not None:

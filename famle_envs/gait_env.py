@@ -95,11 +95,11 @@ class GaitEnv(BulletEnv):
         targets[:, self._blocked] = self.rest_angles[self._blocked]
         for row in targets:
             self._actuate(row)
-            pybullet.stepSimulation(physicsClientId=self._client)
+            pybullet.stepSimulation(physicsClientId=self._world)
 
     def _actuate(self, action: Array) -> None:
         """Sends the servos to joint angles, (n_joints,); no servo sees an error beyond its speed."""
-        states = pybullet.getJointStates(self._robot, self.joints, physicsClientId=self._client)
+        states = pybullet.getJointStates(self._robot, self.joints, physicsClientId=self._world)
         angles = np.array([state[0] for state in states])
         targets = angles + np.minimum(np.maximum(action - angles, -self._reach), self._reach)
         pybullet.setJointMotorControlArray(
@@ -109,7 +109,7 @@ class GaitEnv(BulletEnv):
             targetPositions=targets.tolist(),
             forces=self._forces,
             positionGains=self._gains,
-            physicsClientId=self._client,
+            physicsClientId=self._world,
         )
 
     def _delayed(self, targets: Array) -> Array:

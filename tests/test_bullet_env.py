@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import copy
+import gc
 import math
+import pickle
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -294,3 +297,29 @@ def test_closed_environment_closes_again_but_does_nothing_else(make: Make) -> No
     for use in (lambda: env.step(action), env.reset, env.render, lambda: env.set_situation("paper")):
         with pytest.raises(RuntimeError, match="closed; make a new one"):
             use()
+
+
+def pickled(env: BulletEnv) -> BulletEnv:
+    return pickle.loads(pickle.dumps(env))  # type: ignore[no-any-return]  # noqa: S301 (our own)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, pickled])
+def test_copy_has_a_world_of_its_own(make: Make, copied: Callable[[BulletEnv], BulletEnv]) -> None:
+    env, twin = make(situation=BROKEN), make(situation=BROKEN)
+    action = np.full(env.action_space.shape, 0.5)
+    copy_of_it = copied(env)
+    with pytest.raises(gym.error.ResetNeeded):
+        copy_of_it.step(action)
+    obs, _ = copy_of_it.reset(seed=0)
+    np.testing.assert_array_equal(obs, twin.reset(seed=0)[0])
+    np.testing.assert_array_equal(copy_of_it.step(action)[0], twin.step(action)[0])
+    del copy_of_it
+    gc.collect()
+    assert np.isfinite(env.step(action)[0]).all()
+
+
+def test_copy_of_a_closed_robot_is_closed(make: Make) -> None:
+    env = make()
+    env.close()
+    with pytest.raises(RuntimeError, match="closed"):
+        copy.deepcopy(env).reset()
