@@ -25,7 +25,7 @@ from famle_agent.memory import Memory, Sample, minibatches, whole_memory
 from famle_agent.online import OnlineLoop, OnlineState
 from famle_agent.planning import Model, Planner, RewardFn, bounded
 from famle_agent.simulation import SimulationLearner
-from famle_agent.units import check_action, check_observation
+from famle_agent.units import check_action, check_observation, to_action_space
 
 if TYPE_CHECKING:
     from importlib.resources.abc import Traversable
@@ -163,8 +163,9 @@ class ModelBasedAgent(SimulationLearner):
             NotLearnedError: The agent has no model yet.
             ValueError: The observation has the wrong shape or is not finite.
         """
+        loop = self._loop()
         numbers = check_observation(observation, self.observation_space)
-        obs, loop = self._tensor(np.atleast_2d(numbers)), self._loop()
+        obs = self._tensor(np.atleast_2d(numbers))
         starts = torch.zeros(len(obs), dtype=torch.bool, device=self.device)
         if episode_start is not None:
             starts = torch.tensor(np.atleast_1d(episode_start), dtype=torch.bool, device=self.device)
@@ -190,20 +191,20 @@ class ModelBasedAgent(SimulationLearner):
 
         Args:
             obs: (obs_dim,) or (B, obs_dim).
-            action: (action_dim,) or (B, action_dim), in the action space.
+            action: (action_dim,) or (B, action_dim); clipped to the action space, as a robot clips it.
             next_obs: As ``obs``.
 
         Raises:
             NotLearnedError: The agent has no model yet.
             ValueError: A shape is wrong, or a value is not finite.
         """
-        space = self.observation_space
+        loop, space = self._loop(), self.observation_space
         s, s_next = (self._tensor(np.atleast_2d(check_observation(o, space))) for o in (obs, next_obs))
         a = self._tensor(np.atleast_2d(check_action(action, self.action_space)))
         if not len(s) == len(a) == len(s_next):
             raise ValueError(f"Got {len(s)} observations, {len(a)} actions and {len(s_next)} next observations.")
-        state = replace(self._state_of(len(s)), last=(s, self._action_scale().to_unit(a)))
-        self._live = self._loop().remember(state, s_next, torch.zeros(len(s), dtype=torch.bool, device=self.device))
+        state = replace(self._state_of(len(s)), last=(s, self._action_scale().to_unit(a).clamp(-1.0, 1.0)))
+        self._live = loop.remember(state, s_next, torch.zeros(len(s), dtype=torch.bool, device=self.device))
 
     def begin_episode(self) -> None:
         """Tells the agent that its robot was reset: its plan is void, its memory stays."""
@@ -340,8 +341,7 @@ class ModelBasedAgent(SimulationLearner):
 
     def _to_env(self, action: Tensor) -> Array:
         """From [-1, 1] to the action space."""
-        actions = self._action_scale().from_unit(action).cpu().numpy().astype(self.action_space.dtype)
-        return np.clip(actions, self.action_space.low, self.action_space.high)
+        return to_action_space(action, self.action_space)
 
 
 def _before_reset(obs: Any, dones: Array, infos: Sequence[Mapping[str, Any]]) -> Array:

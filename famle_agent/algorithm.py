@@ -18,7 +18,16 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 
 from famle_agent.dynamics import Dynamics
-from famle_agent.envs import check_spaces, env_attribute, env_id, env_spec, make_env, planning_reward
+from famle_agent.envs import (
+    NEW_OBSERVATIONS,
+    changing_wrappers,
+    check_spaces,
+    env_attribute,
+    env_id,
+    env_spec,
+    make_env,
+    planning_reward,
+)
 from famle_agent.errors import NotLearnedError
 from famle_agent.hyperparameters import Hyperparameters
 from famle_agent.observation import DIMS, ObservationLayout
@@ -115,7 +124,7 @@ class ModelBasedAlgorithm(BaseAlgorithm):
         self.hyperparameters = robot.hyperparameters(mode, self._method(overrides), **{**self._implied, **overrides})
         self._reward_fn = reward_fn
         if self.env is not None:
-            self._env_reward_fn = planning_reward(self.env, self.hyperparameters.planning_reward)
+            self._take_reward(self.env)
         self._learned_reward: LearnedReward | None = None
         self._dims = self._dims_of(angle_dims, quaternion_dims, pose_dims)
         self._generator = torch.Generator(self.device)
@@ -149,7 +158,7 @@ class ModelBasedAlgorithm(BaseAlgorithm):
         wrapped = self._wrap_env(env, self.verbose)
         check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
         self._describe_env(wrapped)
-        self._env_reward_fn = planning_reward(wrapped, self.hyperparameters.planning_reward)
+        self._take_reward(wrapped)
         self.n_envs = wrapped.num_envs
         super().set_env(wrapped, force_reset)
 
@@ -158,6 +167,11 @@ class ModelBasedAlgorithm(BaseAlgorithm):
             raise ValueError("The model normalises by itself; give the environment without VecNormalize.")
         self._env_spec = env_spec(env)
 
+    def _take_reward(self, env: VecEnv) -> None:
+        """Looks for what to maximise in an environment, unless the user has said it."""
+        if self._reward_fn is None:
+            self._env_reward_fn = planning_reward(env, self.hyperparameters.planning_reward)
+
     def _dims_of(self, *given: Sequence[int] | None) -> dict[str, tuple[int, ...]]:
         """The special dimensions of an observation by name: those that were given, else the environment's."""
         names = dict(zip(DIMS, given, strict=True))
@@ -165,6 +179,12 @@ class ModelBasedAlgorithm(BaseAlgorithm):
         if not self.hyperparameters.egocentric:
             heading = known["pose_dims"][2:]
             known |= {"pose_dims": (), "angle_dims": known["angle_dims"] + (heading if len(heading) == 1 else ())}
+        inherited = [name for name, chosen in names.items() if chosen is None and known[name]]
+        if inherited and self.env is not None and (changed := changing_wrappers(self.env, NEW_OBSERVATIONS)):
+            raise ValueError(
+                f"The environment's {', '.join(inherited)} are of what {', '.join(changed)} changes; give those of the "
+                f"wrapped observations ({inherited[0]}=..., or () for none), or the environment without that wrapper."
+            )
         dims = {name: known[name] if chosen is None else tuple(chosen) for name, chosen in names.items()}
         if self.env is not None:
             ObservationLayout(self.observation_space.shape[0], **dims)  # refuses what cannot be
@@ -195,8 +215,8 @@ class ModelBasedAlgorithm(BaseAlgorithm):
         ).to(self.device)
 
     def _new_reward(self) -> LearnedReward:
-        model = self._require_dynamics()
-        return LearnedReward(model.layout, model.action_dim).to(self.device)
+        layout = ObservationLayout(self.observation_space.shape[0], **self._dims)
+        return LearnedReward(layout, self.action_space.shape[0]).to(self.device)
 
     def _known_reward_fn(self) -> RewardFn | None:
         """The user's reward function, or the environment's."""

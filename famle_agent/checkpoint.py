@@ -77,7 +77,7 @@ def read_checkpoint(file: File) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """
     source: io.BytesIO | BinaryIO
     if isinstance(file, (str, os.PathLike)):
-        path = Path(file) if Path(file).exists() else _with_suffix(file)
+        path = Path(file) if Path(file).is_file() else _with_suffix(file)
         source = io.BytesIO(path.read_bytes())
     else:
         path, source = Path("the file"), file
@@ -101,6 +101,8 @@ def read_checkpoint(file: File) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 def save_agent(agent: ModelBasedAgent, file: File) -> None:
     """Writes all that an agent is: see :meth:`ModelBasedAgent.save`."""
+    if agent._env_spec is None and not hasattr(agent, "observation_space"):
+        raise ValueError("This agent has no environment, so that there is nothing to save; make it with one.")
     live = agent._live
     meta = {
         "class": type(agent).__name__,
@@ -113,6 +115,8 @@ def save_agent(agent: ModelBasedAgent, file: File) -> None:
         "env": agent._env_spec,
         "needs_reward_fn": agent._reward_fn is not None,
         "seed": agent.seed,
+        "num_timesteps": agent.num_timesteps,
+        "episodes": agent._episode_num,
         "live": None if live is None else live.counts,
     }
     parts: dict[str, dict[str, Tensor]] = {
@@ -142,6 +146,7 @@ def load_agent(
         situations = tuple(str(name) for name in list(meta["situations"]))
         settings = Hyperparameters.from_dict(meta["hyperparameters"]).to_dict()
         mode, seed, live = meta["mode"], meta["seed"], meta["live"]
+        num_timesteps, episodes = int(meta.get("num_timesteps", 0)), int(meta.get("episodes", 0))
         if not any(mode in robot.modes for robot in known_robots().values()):
             raise ValueError(f"no robot has a mode {mode!r}")
         dims = {name: tuple(meta.get(name, ())) for name in DIMS}
@@ -159,9 +164,11 @@ def load_agent(
         _check_env(env, observation_space, action_space)
     # All settings are in the file, so that its mode need not be known for this environment.
     agent = cls(env, reward_fn=reward_fn, device=device, pretrained=False, **{**settings, **dims, **overrides})
-    agent.mode, agent.situations, agent.seed = mode, situations, seed
+    agent.mode, agent.situations = mode, situations
+    agent.num_timesteps, agent._episode_num = num_timesteps, episodes
     if env is None:
         agent.observation_space, agent.action_space, agent.n_envs = observation_space, action_space, 1
+    agent.set_random_seed(seed)
     try:
         _restore_tensors(agent, tensors, live)
     except (KeyError, RuntimeError, TypeError) as error:
@@ -218,7 +225,7 @@ def _named_env(named: dict[str, Any] | None) -> gym.Env[Any, Any] | None:
     entry_point = gym.registry[named["id"]].entry_point
     if not isinstance(entry_point, str) or not entry_point.startswith("famle_envs."):
         return None
-    return gym.make(named["id"], **named["kwargs"])
+    return gym.make(named["id"], max_episode_steps=named.get("max_episode_steps"), **named["kwargs"])
 
 
 def _check_env(env: Any, observation_space: spaces.Box, action_space: spaces.Box) -> None:
@@ -280,4 +287,4 @@ def _pack(meta: dict[str, Any], tensors: dict[str, Tensor]) -> bytes:
 
 def _with_suffix(file: str | os.PathLike[str]) -> Path:
     path = Path(file)
-    return path if path.suffix else path.with_name(path.name + ".zip")
+    return path if path.suffix or not path.name else path.with_name(path.name + ".zip")

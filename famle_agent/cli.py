@@ -41,10 +41,16 @@ class Demo:
     seed: int = 0
     """Seed of everything."""
     meta_iterations: int | None = None
-    """Iterations of the meta-learning; fewer are faster and worse."""
+    """Iterations of the arm's meta-learning, fewer are faster and worse; the other robots come with a model."""
 
     def __call__(self) -> None:
-        """Runs the demo."""
+        """Runs the demo.
+
+        Raises:
+            ValueError: The situation is unknown, or a robot that comes with a model is told to learn another one.
+        """
+        if self.meta_iterations is not None and self.robot != "reacher":
+            raise ValueError(f"The {self.robot} comes with a model; --meta-iterations is for the arm alone.")
         overrides: dict[str, Any] = {} if self.meta_iterations is None else {"meta_iterations": self.meta_iterations}
         overrides |= {"situation": self.situation} if self.situation else {}
         if self.robot == "ant":
@@ -64,7 +70,7 @@ class MetaLearn:
     out: Path = Path("agent.zip")
     """Where the agent goes."""
     mode: str = "ours"
-    """"ours" or "paper"."""
+    """"ours", "paper", or "original" where the authors' code has the robot."""
     seed: int = 0
     """Seed of everything."""
     jobs: int = -1

@@ -22,8 +22,10 @@ from famle_envs.reality import Profile
 from famle_envs.situation import Situation
 
 __all__ = [
+    "NEW_OBSERVATIONS",
     "EnvLike",
     "SituationEnvs",
+    "changing_wrappers",
     "check_spaces",
     "env_attribute",
     "env_id",
@@ -78,7 +80,7 @@ def env_id(env: VecEnv) -> str | None:
 
 
 def env_spec(env: VecEnv) -> dict[str, Any] | None:
-    """The Gymnasium id and arguments of an environment as JSON types, if that is all there is to say of it."""
+    """The Gymnasium id, arguments and time limit of an environment as JSON types, if that is all there is to say."""
     spec = _plain_spec(env)
     if spec is None:
         return None
@@ -87,7 +89,20 @@ def env_spec(env: VecEnv) -> dict[str, Any] | None:
         json.dumps(kwargs)
     except TypeError:  # an argument that no file can name
         return None
-    return {"id": spec.id, "kwargs": kwargs}
+    return {"id": spec.id, "kwargs": kwargs, "max_episode_steps": spec.max_episode_steps}
+
+
+NEW_OBSERVATIONS = frozenset(
+    {
+        *("FilterObservation", "FrameStackObservation", "NormalizeObservation", "RescaleObservation"),
+        *("ReshapeObservation", "TimeAwareObservation", "TransformObservation"),
+    }
+)
+"""Gymnasium's wrappers after which an observation means something else; a delayed or noisy one means the same."""
+NEW_ACTIONS = frozenset({"RescaleAction", "TransformAction"})
+"""The same for actions."""
+_ONLOOKERS = frozenset({"Monitor", "RecordEpisodeStatistics", "RecordVideo", "HumanRendering"})
+"""Wrappers that change nothing of what a robot and its agent tell each other."""
 
 
 def _plain(value: Any) -> Any:
@@ -98,9 +113,9 @@ def _plain(value: Any) -> Any:
 
 
 def _plain_spec(env: VecEnv) -> EnvSpec | None:
-    """The spec of a registered environment that nothing but a ``Monitor`` wraps."""
+    """The spec of a registered environment whose wrappers, if any, only look on."""
     spec: EnvSpec | None = env.get_attr("spec")[0]
-    if spec is None or any(wrapper.name != "Monitor" for wrapper in spec.additional_wrappers):
+    if spec is None or not _ONLOOKERS.issuperset(wrapper.name for wrapper in spec.additional_wrappers):
         return None
     return spec
 
@@ -136,6 +151,11 @@ def situation_envs(env: VecEnv, envs: Sequence[EnvLike] | None) -> SituationEnvs
                 "This environment names no training situations. Call meta_learn(envs) with a list that holds one "
                 "environment, one factory or one Situation per situation."
             )
+    if isinstance(envs, (str, Mapping, Situation, gym.Env, VecEnv)) or not isinstance(envs, Sequence):
+        raise ValueError(
+            f"meta_learn(envs) needs a list with one environment, factory or Situation per situation, got "
+            f"{type(envs).__name__}; put a single one into a list."
+        )
     if len(envs) == 0:
         raise ValueError("meta_learn(envs) needs at least one environment, factory or Situation.")
     sources, labels = [_source(env, item) for item in envs], list[str]()
@@ -163,8 +183,13 @@ def _source(env: VecEnv, item: EnvLike) -> EnvSource:
             raise ValueError(
                 "Situations need a registered environment without wrappers; give environments or factories instead."
             )
-        # The Monitor that Stable-Baselines3 puts around an environment is no part of the robot.
+        # Who only looks on, as the Monitor that Stable-Baselines3 puts around an environment, is no part of the robot.
         return partial(_make_situation, replace(spec, additional_wrappers=()), item)
+    if not callable(item):
+        raise ValueError(
+            f"A situation is an environment, a factory of one, a Situation, a mapping or a name, got "
+            f"{type(item).__name__}."
+        )
     return partial(_make_from_factory, item)
 
 
@@ -172,6 +197,8 @@ def _make_situation(spec: EnvSpec, situation: Situation | Mapping[str, Any] | st
     try:
         return gym.make(spec, render_mode=None, situation=situation)
     except TypeError as error:
+        if "unexpected keyword argument 'situation'" not in str(error):
+            raise
         raise ValueError(f"{spec.id} takes no situation; give environments or factories instead.") from error
 
 
@@ -207,12 +234,50 @@ def planning_reward(env: VecEnv, name: str) -> RewardFn | None:
         name: What it calls it; empty takes the first of :data:`~famle_agent.policies.REWARDS` that it has.
 
     Raises:
-        ValueError: It has nothing of that name.
+        ValueError: It has nothing of that name; or it has, but a wrapper changes what it would be given, or the robots
+            of a ``VecEnv`` have different tasks.
     """
     if name and not env.has_attr(name):
         raise ValueError(f"The environment has no {name!r}; planning_reward must name a function of it, or be empty.")
-    known: list[RewardFn] = [env_attribute(env, name, None) for name in reward_names(name) if env.has_attr(name)]
-    return known[0] if known else None
+    known = [reward for reward in reward_names(name) if env.has_attr(reward)]
+    if not known:
+        return None
+    if changed := changing_wrappers(env):
+        raise ValueError(
+            f"The environment's {known[0]} is of what {', '.join(changed)} changes; give the reward of the wrapped "
+            "observations and actions (reward_fn=...), or the environment without that wrapper."
+        )
+    if len(tasks := sorted(set(_tasks(env)))) > 1:
+        raise ValueError(
+            f"The robots of this VecEnv have different tasks ({'; '.join(tasks)}), and an agent plans for one. "
+            "Give a reward_fn that finds the task in the observation, or each task an agent of its own."
+        )
+    reward_fn: RewardFn = env_attribute(env, known[0], None)
+    return reward_fn
+
+
+def changing_wrappers(env: VecEnv, changed: frozenset[str] = NEW_OBSERVATIONS | NEW_ACTIONS) -> list[str]:
+    """Names of the wrappers between an environment and its agent that change the meaning of what passes.
+
+    Args:
+        env: The environment. Where it is not registered, its wrappers are not known.
+        changed: Wrappers of Gymnasium that count. One of a ``VecEnv`` that changes the shape of observations does too.
+    """
+    spec: EnvSpec | None = env.get_attr("spec")[0]
+    found = [] if spec is None else [item.name for item in spec.additional_wrappers if item.name in changed]
+    if env.observation_space.shape != env_attribute(env, "observation_space", env.observation_space).shape:
+        found.append(type(env).__name__)
+    return found
+
+
+def _tasks(env: VecEnv) -> list[str]:
+    """What each robot of a ``VecEnv`` should do, as far as the arguments of its environment say that."""
+    specs: list[EnvSpec | None] = env.get_attr("spec")
+    asked = [{} if spec is None else {k: v for k, v in spec.kwargs.items() if k not in _NO_TASK} for spec in specs]
+    return [json.dumps(kwargs, default=repr, sort_keys=True) for kwargs in asked]
+
+
+_NO_TASK = frozenset({"situation", "profile", "render_mode"})
 
 
 def _get(env: gym.Env[Any, Any], name: str, default: Any) -> Any:

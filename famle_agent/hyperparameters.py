@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import typing
+from collections.abc import Iterable
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Any, Literal
 
 from famle_agent.inner_loop import InnerLoop
@@ -167,6 +170,11 @@ class Hyperparameters:
             raise ValueError("adapt_epochs needs an adapt_batch_size; adapt_steps counts steps on the whole memory.")
         if self.adapt_at_reset and self.forget_at_reset:
             raise ValueError("adapt_at_reset learns from what forget_at_reset throws away; choose one of them.")
+        if self.validation_size >= self.memory_size:
+            raise ValueError(
+                f"validation_size must be below memory_size, {self.memory_size}, or nothing is left to learn from; "
+                f"got {self.validation_size}."
+            )
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(map(str, choices))}, got {getattr(self, name)!r}.")
@@ -184,13 +192,7 @@ class Hyperparameters:
                 close = difflib.get_close_matches(key, known, n=1)
                 hint = f" Did you mean {close[0]!r}?" if close else ""
                 raise TypeError(f"There is no setting {key!r}.{hint} Settings: {', '.join(known)}.")
-            default = known[key].default
-            if isinstance(default, int) and isinstance(value, float):
-                raise TypeError(f"{key} must be a whole number, got {value!r}.")
-            if isinstance(default, (int, float)) and (
-                isinstance(value, str) or isinstance(value, bool) != isinstance(default, bool)
-            ):
-                raise TypeError(f"{key} must be a {type(default).__name__}, got {value!r}.")
+            _check_type(key, value)
         return cls(**values)
 
     def to_dict(self) -> dict[str, Any]:
@@ -259,6 +261,29 @@ class Hyperparameters:
         if self.planner == "mppi":
             return MPPI(self.horizon, self.candidates, temperature=self.temperature, **shared)  # type: ignore[arg-type]
         return ICEM(self.horizon, self.candidates, elites=self.elites, **shared)  # type: ignore[arg-type]
+
+
+_KINDS: tuple[tuple[type, type, str], ...] = (
+    (bool, bool, "True or False"),
+    (int, Integral, "a whole number"),
+    (float, Real, "a number"),
+)
+"""Types of settings, what is accepted for them (numpy's numbers too), and what to call that."""
+
+
+def _check_type(key: str, value: Any) -> None:
+    """Refuses a value of a type that a setting cannot have."""
+    hint = typing.get_type_hints(Hyperparameters)[key]
+    kinds = typing.get_args(hint) or (hint,)
+    if value is None and type(None) in kinds:
+        return
+    if key == "hidden":
+        if isinstance(value, str) or not isinstance(value, Iterable):
+            raise TypeError(f"{key} must be a list of whole numbers, got {value!r}.")
+        return
+    for kind, accepted, name in _KINDS:
+        if kind in kinds and (not isinstance(value, accepted) or isinstance(value, bool) != (kind is bool)):
+            raise TypeError(f"{key} must be {name}, got {value!r}.")
 
 
 _ONLINE = {

@@ -36,7 +36,7 @@ class Journey:
         seconds: Wall time of each plan, (n,); adapting, which the wrapper does after the action, is not in it.
         believed: The most likely situation after each action.
         reached: Whether the robot reached its goal, where it has one.
-        fell: Whether the episode ended without that.
+        fell: Whether the episode ended because the robot fell.
         frames: Pictures, where they were asked for.
     """
 

@@ -59,8 +59,8 @@ class OnlineState:
         return tensors | belief | {"plan": self.plan}
 
     @classmethod
-    def from_tensors(cls, tensors: dict[str, Tensor], steps: int, adaptations: int, adapted_at: int = 0) -> OnlineState:
-        """The inverse of :meth:`to_tensors`; the counts are :attr:`counts`, of which older files lack the last."""
+    def from_tensors(cls, tensors: dict[str, Tensor], steps: int, adaptations: int, adapted_at: int) -> OnlineState:
+        """The inverse of :meth:`to_tensors`; the counts are :attr:`counts`."""
 
         def part(prefix: str) -> dict[str, Tensor]:
             return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}

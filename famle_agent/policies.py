@@ -14,7 +14,7 @@ from torch import Tensor
 
 from famle_agent.dynamics import Dynamics
 from famle_agent.planning import Model, Planner, RewardFn, imagine, shift
-from famle_agent.units import ActionScale
+from famle_agent.units import ActionScale, to_action_space
 
 __all__ = [
     "REWARDS",
@@ -78,18 +78,18 @@ class PlanningPolicy:
         members: int,
         reward_fn: RewardFn,
         planner: Planner,
-        scale: ActionScale,
+        action_space: gym.spaces.Box,
         generator: torch.Generator,
     ) -> None:
         self._model, self._members, self._reward_fn = model, members, reward_fn
-        self._planner, self._scale, self._generator = planner, scale, generator
+        self._planner, self._space, self._generator = planner, action_space, generator
         self._plan: Tensor | None = None
 
     @torch.no_grad()
     def __call__(self, obs: Array, episode_start: bool) -> Array:
         """Plans from where the last plan left off."""
         if self._plan is None or episode_start:
-            self._plan = torch.zeros(1, self._planner.horizon, len(self._scale.low))
+            self._plan = torch.zeros(1, self._planner.horizon, *self._space.shape)
         state = torch.as_tensor(obs, dtype=torch.float32)[None]
 
         def judge(tau: Tensor) -> Tensor:
@@ -97,7 +97,7 @@ class PlanningPolicy:
 
         action, plan = self._planner.plan(judge, self._plan, self._generator)
         self._plan = shift(plan)
-        return self._scale.from_unit(action[0]).numpy()
+        return to_action_space(action[0], self._space)
 
 
 @dataclass(frozen=True)
@@ -144,6 +144,6 @@ class make_planning:  # noqa: N801
             self.model.members,
             lambda obs, action, next_obs: in_env_units(obs, scale.from_unit(action), next_obs),
             self.planner,
-            scale,
+            env.action_space,  # type: ignore[arg-type]
             torch.Generator().manual_seed(int(rng.integers(2**63))),
         )

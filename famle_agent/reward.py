@@ -57,7 +57,8 @@ class LearnedReward(nn.Module):
         """Least squares by Adam on transitions with any leading axes."""
         x, y = self._inputs(obs, action, next_obs).flatten(0, -2), reward.flatten()
         self.mean.copy_(x.mean(dim=0))
-        self.std.copy_(x.std(dim=0).clamp(min=1e-6))
+        std = x.std(dim=0)
+        self.std.copy_(torch.where(std > 1e-6, std, 1.0))  # what never changed must not be blown up
         self.reward_mean.copy_(y.mean())
         self.reward_std.copy_(y.std().clamp(min=1e-6))
         x, y = (x - self.mean) / self.std, (y - self.reward_mean) / self.reward_std

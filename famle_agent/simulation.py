@@ -137,7 +137,13 @@ class SimulationLearner(ModelBasedAlgorithm):
         if folder is not None and self.seed is not None:
             self._generator.manual_seed(self.seed)  # the same call draws the same numbers, be it the first or not
         hooks.on_training_start(locals(), globals())
-        self._go_round(source, _Call(rounds, run, n_jobs, progress_bar), hooks)
+        known = self.situations, self.dynamics, self._learned_reward
+        try:
+            self._go_round(source, _Call(rounds, run, n_jobs, progress_bar), hooks)
+        except BaseException:
+            self.situations, self.dynamics, self._learned_reward = known  # half-learnt models are none
+            self.num_timesteps = 0
+            raise
         hooks.on_training_end()
         self.num_timesteps = 0
         return self
@@ -163,7 +169,6 @@ class SimulationLearner(ModelBasedAlgorithm):
         settings, last, going_on = self.hyperparameters, number == call.rounds, True
         log_interval = max(1, settings.iterations(call.rounds) // 200)
         left = settings.iterations(number, last) - self.num_timesteps
-        known = self.situations, self.dynamics, self._learned_reward
         with call.bar("Meta-learning", number, left, "it") as bar:
 
             def on_iteration(scalars: dict[str, float]) -> bool:
@@ -182,13 +187,9 @@ class SimulationLearner(ModelBasedAlgorithm):
 
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(self._draw_seed())  # initial weights come from torch's global generator
-                try:
-                    self.situations = transitions.situations
-                    self._learn_model(transitions, Round(number, last, on_iteration, progress))
-                    self._learn_reward(transitions)
-                except BaseException:
-                    self.situations, self.dynamics, self._learned_reward = known  # half-learnt models are none
-                    raise
+                self.situations = transitions.situations
+                self._learn_reward(transitions)  # first, so that callbacks can let the agent act
+                self._learn_model(transitions, Round(number, last, on_iteration, progress))
         return going_on
 
     def collect(
@@ -230,6 +231,8 @@ class SimulationLearner(ModelBasedAlgorithm):
         return {
             "agent": type(self).__name__,
             "env": self._env_spec,
+            "dimensions": {name: list(dims) for name, dims in self._dims.items()},
+            "needs_reward_fn": self._reward_fn is not None,
             "seed": self.seed,
             "situations": list(source.situations),
             "transitions": source.digest() if isinstance(source, Transitions) else None,
@@ -250,7 +253,7 @@ class SimulationLearner(ModelBasedAlgorithm):
         return replace(transitions, action=action.cpu().numpy())
 
     def _learn_reward(self, transitions: Transitions) -> None:
-        if self._known_reward_fn() is None and self.dynamics is not None:
+        if self._known_reward_fn() is None:
             self._learned_reward = self._new_reward()
             obs, action, next_obs = self._tensors(transitions.obs, transitions.action, transitions.next_obs)
             self._learned_reward.fit(obs, action, next_obs, self._tensor(transitions.reward), self._generator)

@@ -11,7 +11,7 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-__all__ = ["ActionScale", "check_action", "check_observation"]
+__all__ = ["ActionScale", "check_action", "check_observation", "to_action_space"]
 
 Array = npt.NDArray[Any]
 
@@ -43,6 +43,12 @@ class ActionScale:
     def from_unit(self, action: Tensor) -> Tensor:
         """From [-1, 1] to the action space, (..., action_dim)."""
         return action if self.is_identity else self.low + 0.5 * (action + 1.0) * (self.high - self.low)
+
+
+def to_action_space(action: Tensor, space: spaces.Box) -> Array:
+    """Actions in [-1, 1], (..., action_dim), as arrays that lie in an action space, rounding included."""
+    actions = ActionScale.of(space, action.device).from_unit(action).cpu().numpy()
+    return np.clip(actions.astype(space.dtype), space.low, space.high)
 
 
 def check_observation(observation: Any, space: spaces.Box) -> Array:

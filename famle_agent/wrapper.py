@@ -35,12 +35,12 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
     def __init__(self, env: gym.Env[Array, Array], agent: ModelBasedAgent) -> None:
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, agent=agent)
         gym.Wrapper.__init__(self, env)
+        agent.posterior()  # an agent without a model should say so here, not in the middle of a run
         if env.observation_space != agent.observation_space or env.action_space != agent.action_space:
             raise ValueError(
                 f"The environment's spaces, {env.observation_space} and {env.action_space}, are not the agent's, "
                 f"{agent.observation_space} and {agent.action_space}."
             )
-        agent.posterior()  # an agent without a model should say so here, not in the middle of a run
         self.agent = agent
         self._obs: Array | None = None
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,7 +15,7 @@ import torch
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from famle_agent import FAMLE, OnlineState, Transitions
+from famle_agent import FAMLE, FAMLEWrapper, NotLearnedError, OnlineState, Transitions
 from tests.helpers import run, some_observations
 
 Array = npt.NDArray[Any]
@@ -259,3 +260,20 @@ def test_wrong_transitions_are_refused(
     with pytest.raises(ValueError, match=message):
         quick_agent.observe(obs, action, next_obs)
     assert quick_agent.belief.adaptations == 0
+
+
+def test_action_is_remembered_as_the_robot_applied_it(quick_agent: FAMLE, make_env: MakeEnv) -> None:
+    robot = FAMLEWrapper(make_env(), quick_agent)
+    robot.reset(seed=0)
+    robot.step(np.array([100.0, -100.0, 0.5, 0.0, 1.0]))
+    np.testing.assert_array_equal(quick_agent._live.memory.action[0, -1].numpy(), [1.0, -1.0, 0.5, 0.0, 1.0])
+
+
+def test_agent_without_an_environment_says_what_to_do(make_env: MakeEnv) -> None:
+    nobody = FAMLE(None, device="cpu")
+    with pytest.raises(NotLearnedError, match="meta_learn"):
+        nobody.predict(np.zeros(12))
+    with pytest.raises(NotLearnedError, match="meta_learn"):
+        FAMLEWrapper(make_env(), nobody)
+    with pytest.raises(ValueError, match="nothing to save"):
+        nobody.save(io.BytesIO())

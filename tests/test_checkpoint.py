@@ -112,6 +112,31 @@ def test_seed_can_be_changed(agent_file: Path) -> None:
     assert not np.array_equal(one, other)
 
 
+def test_loaded_agent_counts_on_and_its_robot_starts_as_seeded(quick_agent: FAMLE, reload: Load) -> None:
+    quick_agent.learn(20)
+    loaded = reload(quick_agent)
+    assert loaded.num_timesteps == 20
+    assert loaded.learn(10, reset_num_timesteps=False).num_timesteps == 30
+
+
+def test_robot_of_a_loaded_agent_starts_alike_each_time(reload: Load) -> None:
+    agent = FAMLE("ant", seed=3, device="cpu")
+    first, second = (reload(agent).get_env().reset() for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+    np.testing.assert_array_equal(first, FAMLE("ant", seed=3, device="cpu").get_env().reset())
+
+
+def test_time_limit_is_kept(make_env: MakeEnv, reload: Load) -> None:
+    loaded = reload(FAMLE(make_env(max_episode_steps=7), device="cpu"))
+    assert loaded.get_env().get_attr("spec")[0].max_episode_steps == 7
+
+
+def test_folder_of_the_same_name_is_not_taken_for_the_file(agent_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine.zip").write_bytes(agent_file.read_bytes())
+    assert FAMLE.load(tmp_path / "mine", device="cpu").dynamics is not None
+
+
 def test_other_mode_is_refused(agent_file: Path) -> None:
     with pytest.raises(ValueError, match="no other mode"):
         FAMLE.load(agent_file, mode="paper")
@@ -175,7 +200,7 @@ def test_reward_function_has_to_be_given_again(transitions: Transitions, reload:
 
 def test_environment_that_no_file_can_name_has_to_be_given(make_env: MakeEnv, reload: Load) -> None:
     unregistered = ReacherEnv()
-    wrapped = gym.wrappers.RescaleAction(make_env(), np.float32(-0.5), np.float32(0.5))
+    wrapped = gym.wrappers.TransformReward(make_env(), float)
     for env in (unregistered, wrapped, make_env(goal=np.array([1.0, 1.0]))):
         agent = FAMLE(env, device="cpu")
         loaded = reload(agent)

@@ -164,3 +164,12 @@ def test_benchmark_and_report_from_the_command_line(
     main(["report"])
     assert "PPO" in (tmp_path / "benchmarks/report/report.md").read_text()
     assert "report.md" in capsys.readouterr().out
+
+
+def test_robot_that_comes_with_a_model_is_not_taught_by_a_demo(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["demo", "--robot", "ant", "--meta-iterations", "2", "--out", str(tmp_path / "out")])
+    assert "--meta-iterations is for the arm alone" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -315,11 +316,37 @@ def test_value_out_of_range_is_refused(name: str, value: Any) -> None:
         ("rounds", 1.5),
         ("members", 2.0),
         ("degrees_of_freedom", "3"),
+        ("adapt_steps", 2.5),
+        ("adapt_steps", "5"),
+        ("adapt_lr", "0.1"),
+        ("horizon", None),
+        ("hidden", 64),
+        ("hidden", "64"),
     ],
 )
 def test_value_of_the_wrong_type_is_refused(name: str, value: Any) -> None:
     with pytest.raises(TypeError, match=name):
         Hyperparameters.from_dict({name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("adapt_steps", None),
+        ("adapt_steps", np.int64(3)),
+        ("adapt_lr", np.float32(0.5)),
+        ("adapt_lr", 1),
+        ("hidden", [32]),
+        ("hidden", np.array([32, 16])),
+    ],
+)
+def test_numbers_of_any_kind_are_taken(name: str, value: Any) -> None:
+    assert np.array_equal(getattr(Hyperparameters.from_dict({name: value}), name), value)
+
+
+def test_validation_leaves_something_to_learn_from() -> None:
+    with pytest.raises(ValueError, match="below memory_size, 50"):
+        Hyperparameters(memory_size=50, validation_size=50)
 
 
 def test_unknown_mode_names_the_known_ones() -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import pickle
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -157,3 +158,17 @@ def test_planning_leaves_the_model_as_it_is() -> None:
     make_planning(model, PLANNERS[0], None)(Plane(), 0, np.random.default_rng(0))(np.zeros(2, np.float32), True)
     for name, value in model.state_dict().items():
         assert torch.equal(value, before.state_dict()[name])
+
+
+@pytest.mark.parametrize(("low", "high"), [(-1.1, 0.8), (-0.3, 0.7), (-2.9, 0.1)])
+def test_planned_action_lies_in_the_action_space(low: float, high: float) -> None:
+    space = spaces.Box(low, high, (2,), np.float64)
+    ends = torch.tensor([[[1.0, -1.0]] * 2])
+    planner: Any = SimpleNamespace(horizon=2, plan=lambda judge, plan, generator: (ends[:, 0], ends))
+    chance = torch.Generator()
+    policy = PlanningPolicy(
+        lambda obs, action: obs, 1, lambda obs, action, next_obs: obs[..., 0], planner, space, chance
+    )
+    action = policy(np.zeros(2, dtype=np.float32), True)
+    assert space.contains(action)
+    np.testing.assert_allclose(action, [high, low], rtol=1e-6)
