@@ -36,7 +36,7 @@ def compare(
 
     Raises:
         ValueError: A method is unknown.
-        ReplicateError: A replicate failed; all others have run and are stored.
+        ReplicateError: A replicate failed, or what a method learns in simulation; all others have run and are stored.
     """
     for method in methods:
         if method not in known:
@@ -51,12 +51,20 @@ def compare(
             ]
         else:
             replicates = [Replicate(method, task.seed, partial(run, method, task)) for task in tasks]
-        if not all(is_stored(some, folder) for some in replicates):
-            with parallel(options.backend):
-                known[method].learn(tasks[0])  # once, before the replicates want it in their processes
         try:
+            if not all(is_stored(some, folder) for some in replicates):
+                _learn(method, known[method], tasks[0], options)
             run_replicates(replicates, folder, options.jobs, options.backend)
         except ReplicateError as error:
             failure = failure or error
     if failure is not None:
         raise failure
+
+
+def _learn(name: str, method: Method, task: Task, options: Options) -> None:
+    """Learns what the replicates share, once, before they want it in their processes."""
+    try:
+        with parallel(options.backend):
+            method.learn(task)
+    except Exception as error:
+        raise ReplicateError(f"{name} could not be learnt, its replicates have not run: {error}") from error

@@ -104,6 +104,7 @@ def _result(task: Task, history: History, i: int, steps: int) -> Result:
         "situation": str(task.situation),
         "returns": [round(value, 3) for value in history.returns[i][:whole]],
         "lengths": list(lengths[:whole]),
+        "wall_seconds": history.seconds,  # of all sittings of a life that was interrupted
         "seconds_per_step": history.seconds / sum(map(sum, history.lengths)),
     }
 

@@ -129,12 +129,13 @@ def run_replicates(replicates: Iterable[Replicate | Fleet], folder: Path, jobs: 
         parallel(backend),
         tqdm(total=sum(len(some.seeds) for some in todo), desc=str(folder), unit="replicate") as bar,
     ):
+        origin = provenance(sys.argv)  # of the code that runs, whatever is committed meanwhile
         for some, results in as_completed(calls, jobs):
             if isinstance(results, str):
                 failure = failure or results
             else:
                 for seed, result in zip(some.seeds, results, strict=True):
-                    write_json(_path(folder, some.method, seed), result | provenance(sys.argv))
+                    write_json(_path(folder, some.method, seed), result | origin)
             bar.set_postfix_str(f"{some.method}-{some.seeds[-1]}")
             bar.update(len(some.seeds))
     if failure:
@@ -168,8 +169,14 @@ def provenance(argv: list[str]) -> Result:
 
 
 def commit() -> str:
-    """What git calls the code in the working folder, "-dirty" where it was changed since; "unknown" without git."""
-    described = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False)
+    """What git calls this code, "-dirty" where it was changed since; "unknown" without git."""
+    described = subprocess.run(
+        ["git", "describe", "--always", "--dirty"],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=Path(__file__).parent,
+    )
     return described.stdout.strip() or "unknown"
 
 
@@ -200,7 +207,7 @@ def _run(some: Replicate | Fleet) -> tuple[Replicate | Fleet, list[Result] | str
     except Exception:
         return some, f"{some.method}, seed {some.seeds[0]}: {traceback.format_exc()}"
     shared = {"wall_seconds": time.perf_counter() - start} | ({} if len(results) == 1 else {"fleet": len(results)})
-    return some, [{"method": some.method, "seed": seed, **result, **shared} for seed, result in results.items()]
+    return some, [{"method": some.method, "seed": seed, **shared, **result} for seed, result in results.items()]
 
 
 def _command(argv: list[str]) -> list[str]:

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import torch
 import tyro
 from rich.console import Console
@@ -28,6 +27,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 import famle_envs  # noqa: F401 (registers the robots)
 from benchmarks.harness import Result, provenance, write_json
+from benchmarks.ppo import SETTINGS
+from benchmarks.reporting.study import StepTime
 from famle_agent import AMPC, AMPCMAML, FAMLE
 from famle_agent.robots import known_robots
 
@@ -50,7 +51,7 @@ AGENTS: Mapping[str, Callable[[str], BaseAlgorithm]] = {
     "ampc-reptile": lambda robot: AMPCMAML(robot, **HARDLY),
     "ampc-fomaml": lambda robot: AMPCMAML(robot, meta_learner="first-order-maml", **HARDLY),
     "ampc-maml": lambda robot: AMPCMAML(robot, meta_learner="maml", **HARDLY),
-    "ppo": lambda robot: PPO("MlpPolicy", known_robots()[robot].env_id, n_steps=100, batch_size=50, device="cpu"),
+    "ppo": lambda robot: PPO("MlpPolicy", known_robots()[robot].env_id, device="cpu", **SETTINGS.get(robot, {})),
 }
 """Agents by method, for a robot."""
 
@@ -65,8 +66,8 @@ class Args:
     """How often each method has its turn."""
     steps: int = 50
     """Robot steps of a turn."""
-    slow_steps: int = 5
-    """Robot steps of a turn of the methods that judge 10,000 candidates."""
+    slow_steps: int = 25
+    """Robot steps of a turn of the methods that judge 10,000 candidates; the paper's settings adapt once in so many."""
     out: Path = Path("benchmarks/results")
     """Folder of the result."""
 
@@ -114,18 +115,18 @@ def measure(robot: str, args: Args) -> dict[str, list[float]]:
         turns["robot alone"].append(bare_milliseconds(env, args.steps))
         for name, agent in agents.items():
             slow = isinstance(agent, FAMLE) and agent.hyperparameters.planner == "random_shooting"
-            # PPO learns every 100 steps: a turn of PPO has one whole cycle.
-            steps = 100 if isinstance(agent, PPO) else args.slow_steps if slow else args.steps
+            # A turn of PPO is one rollout, and the learning from it.
+            steps = agent.n_steps if isinstance(agent, PPO) else args.slow_steps if slow else args.steps
             turns[name].append(milliseconds(agent, steps))
     return turns
 
 
 def table(times: Mapping[str, Mapping[str, list[float]]]) -> Table:
-    """Medians over the turns."""
+    """Medians over the turns, and of the ratios within a turn."""
     result = Table("method", *times, title="ms a control step (times the robot alone), median over turns")
     for name in next(iter(times.values())):
-        medians = {robot: (np.median(turns[name]), np.median(turns["robot alone"])) for robot, turns in times.items()}
-        result.add_row(name, *(f"{mine:.2f} (x {mine / bare:.1f})" for mine, bare in medians.values()))
+        each = [StepTime.of(turns[name], turns["robot alone"]) for turns in times.values()]
+        result.add_row(name, *(f"{time.milliseconds:.2f} (x {time.times_robot_alone:.1f})" for time in each))
     return result
 
 

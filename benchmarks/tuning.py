@@ -59,6 +59,7 @@ def main(args: Args) -> None:
     """Runs and prints.
 
     Raises:
+        ReplicateError: A value failed, as one with which the learning diverges; the others are printed first.
         ValueError: The method is not meta-trained for the benchmark, or a value is not one of JSON.
     """
     robot = ROBOTS[args.robot]
@@ -68,17 +69,18 @@ def main(args: Args) -> None:
         for name in args.methods
         for value in args.values
     }
-    if robot.lives:
-        folder = args.out / f"{args.robot}-{args.steps}"
-        run, fleets = partial(_live_alone, args=args, known=known), partial(_live, args=args, known=known)
-        compare(list(known), tasks, run, folder, args, known, fleets)
-    else:
-        folder = args.out / args.robot
-        compare(list(known), tasks, partial(gait_robots.run, known=known), folder, args, known)
-    results = load_results(folder)
-    for name in known:
-        scores = [robot.score(result) for result in results if result["method"] == name][: args.replicates]
-        print(f"{args.robot}, {name}: {np.mean(scores):.1f} of", *(f"{score:.1f}" for score in scores))
+    folder = args.out / (f"{args.robot}-{args.steps}" if robot.lives else args.robot)
+    try:
+        if robot.lives:
+            run, fleets = partial(_live_alone, args=args, known=known), partial(_live, args=args, known=known)
+            compare(list(known), tasks, run, folder, args, known, fleets)
+        else:
+            compare(list(known), tasks, partial(gait_robots.run, known=known), folder, args, known)
+    finally:
+        results = load_results(folder) if folder.exists() else []
+        for name in known:
+            if scores := [robot.score(result) for result in results if result["method"] == name][: args.replicates]:
+                print(f"{args.robot}, {name}: {np.mean(scores):.1f} of", *(f"{score:.1f}" for score in scores))
 
 
 def method_with(name: str, setting: str, value: str) -> Method:

@@ -30,7 +30,11 @@ def play(calls: list[str], tmp_path: Path) -> Callable[..., Path]:
     def learning(name: str) -> Callable[[Task], object]:
         return lambda task: calls.append(f"{name} learns")
 
+    def diverging(task: Task) -> object:
+        raise ArithmeticError("the learning diverges")
+
     known = {name: Method(none, learning(name)) for name in ("one", "other")}
+    known["diverging"] = Method(none, diverging)
     known["fleet"] = replace(known["one"], learn=learning("fleet"), fleet=none)
 
     def run(method: str, task: Task) -> Result:
@@ -86,7 +90,7 @@ def test_robots_act_in_step_where_method_and_benchmark_can(play: Callable[..., P
 
 
 def test_unknown_method_is_refused_before_anything_runs(play: Callable[..., Path], calls: list[str]) -> None:
-    with pytest.raises(ValueError, match=r"no method 'magic'\. Methods: one, other, fleet"):
+    with pytest.raises(ValueError, match=r"no method 'magic'\. Methods: one, other, diverging, fleet"):
         play(["one", "magic"], [0])
     assert calls == []
 
@@ -102,3 +106,9 @@ def test_failing_replicate_does_not_end_the_other_methods(play: Callable[..., Pa
     with pytest.raises(ReplicateError):
         play(["one", "other"], [13])
     assert "other 13" in calls
+
+
+def test_learning_that_fails_does_not_end_the_other_methods(play: Callable[..., Path], calls: list[str]) -> None:
+    with pytest.raises(ReplicateError, match=r"diverging could not be learnt.*the learning diverges"):
+        play(["diverging", "other"], [0])
+    assert calls == ["other learns", "other 0"]

@@ -207,9 +207,10 @@ def test_probability_of_improvement_is_of_famle_over_the_others(ant: Path) -> No
 
 
 def test_baselines_that_win_are_named(arm: Path) -> None:
-    store_curves(arm, "famle", [[30.0] * 10] * 2)
-    store_curves(arm, "oracle", [[40.0] * 10] * 2)
-    store_curves(arm, "ampc", [[1.0] * 5 + [38.0] * 5] * 2)
+    store_curves(arm, "famle", [[30.0] * 10] * 6)
+    store_curves(arm, "oracle", [[40.0] * 10] * 6)
+    store_curves(arm, "ampc", [[1.0] * 5 + [38.0] * 5] * 6)
+    store_curves(arm, "ppo", [[50.0] * 10] * 2)  # too few to be sure of
     line = next(line for line in report(arm)[0].splitlines() if line.startswith("Better than FAMLE"))
     first, mean, last = line.split(";")
     assert first.endswith(": oracle (return of the first episode)")

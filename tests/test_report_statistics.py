@@ -42,6 +42,14 @@ def test_one_replicate_says_nothing_of_improvement() -> None:
         probability_of_improvement([], [1.0])
 
 
+@pytest.mark.parametrize("paired", [False, True])
+@pytest.mark.parametrize(("n", "bound"), [(2, 0.16), (3, 0.29), (10, 0.69)])
+def test_few_replicates_that_all_win_are_no_certainty(n: int, bound: float, paired: bool) -> None:
+    x, y = np.arange(n) + 100.0, np.arange(n)
+    assert probability_of_improvement(x, y, paired) == pytest.approx((1.0, bound, 1.0), abs=0.005)
+    assert probability_of_improvement(y, x, paired) == pytest.approx((0.0, 0.0, 1.0 - bound), abs=0.005)
+
+
 @given(samples)
 def test_interquartile_mean_lies_in_its_interval_and_among_the_values(values: list[float]) -> None:
     mean, low, high = interquartile_mean(values)

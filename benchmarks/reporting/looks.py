@@ -45,7 +45,7 @@ LOOKS: Mapping[str, Look] = {
     "members-3": Look("FAMLE, ensemble of three", "#44aa99"),
     "random-shooting": Look("FAMLE, random shooting with 10,000 candidates", "#8c6d31", "--"),
     "famle-frozen": Look("FAMLE, no adaptation", "#777777", ":"),
-    "without-embeddings": Look("without embeddings", "#b8860b"),
+    "without-embeddings": Look("without embeddings, two rounds of ten", "#b8860b"),
     "ampc": Look("AMPC", "#8c510a", paper="AMPC"),
     "ampc-reptile": Look("AMPC-MAML (Reptile)", "#e69f00", paper="AMPC-MAML"),
     "ampc-reptile-paper": Look("AMPC-MAML (Reptile), the paper's settings", "#e69f00", "-."),

@@ -73,7 +73,8 @@ with quartiles in round brackets; IQM is the interquartile mean with its bootstr
 *Of the oracle* is the ratio of IQMs over the seeds that both have, turned over where fewer is better, so that 100 % is
 as good as the oracle; in brackets stands how many seeds that is, where a method has more. *P(FAMLE better)* is the
 probability that a replicate of FAMLE does better than one of the other method, a tie counted half, with its bootstrap
-95 % interval; where a method has one replicate the interval is all of [0, 1]. Where each seed has a damage of its own,
+95 % interval; that is Clopper and Pearson's where all comparisons go the same way, and all of [0, 1] where a method has
+one replicate. Where each seed has a damage of its own,
 FAMLE is compared with the other method on the same damage alone, and it is the fraction of damages on which it does
 better; in round brackets stands how many they are, where a method has more. Intervals take replicates for independent
 also where they share networks.""",
@@ -90,7 +91,8 @@ robot steps, but for those of which the title says that they have fewer; *solved
 (the first of three episodes in a row above FAMLE's median of its last five in these steps) and *its last* episodes are
 over all steps of a method. An episode is the resolution of all of these: where FAMLE is solved with the first one,
 *faster by* counts episodes. Returns are those of the life itself, PPO's with the noise by which it explores. The time
-of a step contains the simulated robot and all learning on the way.""",
+of a step contains the simulated robot and all learning on the way; only in one run, that of the authors' settings is
+without their learning at the end of an episode.""",
     "episode": """A robot walks again as soon as its mean speed over 100 steps is above 0.8 m/s, the paper's solved
 mark; the steps since the damage are a median, in which one that never does is infinite, and those of the slowest that
 does. Where the damage strikes on the way, one whose mean speed never falls to the mark walks on, after 0 steps. The
@@ -275,8 +277,12 @@ def _better_than_famle(study: Study, rows: Sequence[Row]) -> str:
 
 
 def _sources(study: Study) -> str:
-    """What makes the results, and what made each of them."""
-    lines = [f"`{study.experiment.command}` makes the results. {study.experiment.shared} These were made by:", ""]
+    """What runs the experiment, what is missing, and what made each of the results."""
+    experiment = study.experiment
+    parts = [f"`{experiment.command}` runs this.", experiment.shared]
+    if "oracle" not in study.runs:
+        parts.append("No oracle has been measured here.")
+    lines = [f"{' '.join(parts)} These results were made by:", ""]
     for (commit, command), methods in study.provenance.items():
         names = ", ".join(look(method).label + f" (`{method}`)" for method in methods)
         lines.append(f"- `{command}` at `{commit}`: {names}")

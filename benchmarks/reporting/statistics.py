@@ -70,7 +70,9 @@ def probability_of_improvement(
 ) -> tuple[float, float, float]:
     """P(X > Y), a tie counted half, and its 95 % bootstrap interval.
 
-    One replicate says nothing of how replicates differ: the interval is then all of [0, 1].
+    One replicate says nothing of how replicates differ: the interval is then all of [0, 1]. Where all comparisons go
+    the same way, resampling finds no spread either; the interval is then Clopper and Pearson's, of as many trials as
+    the smaller group has replicates.
 
     Args:
         x: A figure of each replicate of one group, (n,).
@@ -86,8 +88,11 @@ def probability_of_improvement(
         raise ValueError("Both groups need a replicate to be compared.")
     wins = _pairs_won if paired else _wins
     p = float(wins(*groups))
-    if min(len(group) for group in groups) < 2:
+    if (n := min(len(group) for group in groups)) < 2:
         return p, 0.0, 1.0
+    if p in (0.0, 1.0):
+        exact = stats.binomtest(round(p * n), n).proportion_ci(0.95)
+        return p, float(exact.low), float(exact.high)
     interval = stats.bootstrap(
         groups, wins, paired=paired, n_resamples=_RESAMPLES, method="percentile", rng=np.random.default_rng(0)
     ).confidence_interval

@@ -15,7 +15,7 @@ from benchmarks.reporting.looks import in_order, look
 from benchmarks.reporting.registry import Experiment, Kind
 from benchmarks.reporting.statistics import Array, quartiles
 
-__all__ = ["LAST", "ROBOT_ALONE", "SUBJECT", "Measure", "Study", "quartiles_over_steps", "read_study"]
+__all__ = ["LAST", "ROBOT_ALONE", "SUBJECT", "Measure", "StepTime", "Study", "quartiles_over_steps", "read_study"]
 
 SUBJECT = "famle"
 """The method that all others are compared with."""
@@ -55,18 +55,36 @@ class Measure:
 
 
 @dataclass(frozen=True)
+class StepTime:
+    """What a control step of a method costs, where methods took turns.
+
+    Attributes:
+        milliseconds: The median over turns.
+        times_robot_alone: The median of the ratios within a turn, since a machine may slow down between two.
+    """
+
+    milliseconds: float
+    times_robot_alone: float
+
+    @classmethod
+    def of(cls, turns: Sequence[float], alone: Sequence[float]) -> StepTime:
+        """From the milliseconds a step of each turn, of a method and of the robot alone."""
+        return cls(float(np.median(turns)), float(np.median(np.divide(turns, alone))))
+
+
+@dataclass(frozen=True)
 class Study:
     """The stored replicates of one experiment.
 
     Attributes:
         experiment: What was done.
         runs: The replicates of each method by seed, methods in the order in which they are shown.
-        step_times: Milliseconds of a control step by method, all measured in one run; empty where nobody did.
+        step_times: What a control step costs by method, all measured in one run; empty where nobody did.
     """
 
     experiment: Experiment
     runs: Mapping[str, Sequence[Result]]
-    step_times: Mapping[str, float] = field(default_factory=dict)
+    step_times: Mapping[str, StepTime] = field(default_factory=dict)
 
     @cached_property
     def lived(self) -> Mapping[str, int]:
@@ -144,8 +162,9 @@ class Study:
     @cached_property
     def times(self) -> Mapping[str, float]:
         """Milliseconds of a control step of the methods that have any: in one run where that was measured."""
-        time_of = self.step_times.get if self.step_times else self.own_time
-        return {method: time for method in self.runs if (time := time_of(method)) is not None}
+        if self.step_times:
+            return {method: self.step_times[method].milliseconds for method in self.runs if method in self.step_times}
+        return {method: time for method in self.runs if (time := self.own_time(method)) is not None}
 
     def trace(self, run: Result) -> tuple[Array, Array]:
         """What happened over a replicate's life: robot steps or actions, and return, speed or x at each, both (n,)."""
@@ -253,13 +272,13 @@ def read_study(experiment: Experiment, results: Path) -> Study | None:
     return Study(experiment, runs, _step_times(experiment, results)) if runs else None
 
 
-def _step_times(experiment: Experiment, results: Path) -> Mapping[str, float]:
+def _step_times(experiment: Experiment, results: Path) -> Mapping[str, StepTime]:
     """What `benchmarks.step_time` has stored of a robot; the other kinds of experiments count plans and not steps."""
     path = results / "step-time.json"
     if experiment.kind not in ("curves", "episode") or not path.exists():
         return {}
     turns: Mapping[str, Sequence[float]] = _read(path, ("times",))["times"].get(experiment.robot, {})
-    return {method: float(np.median(milliseconds)) for method, milliseconds in turns.items()}
+    return {method: StepTime.of(milliseconds, turns[ROBOT_ALONE]) for method, milliseconds in turns.items()}
 
 
 def _read(path: Path, needed: Sequence[str]) -> Result:

@@ -22,7 +22,7 @@ from benchmarks.reporting.statistics import (
     quartiles,
     solved_at,
 )
-from benchmarks.reporting.study import LAST, ROBOT_ALONE, SUBJECT, Measure, Study
+from benchmarks.reporting.study import LAST, SUBJECT, Measure, Study
 
 __all__ = ["Row", "figures", "replicates", "to_csv"]
 
@@ -97,7 +97,7 @@ def _times(study: Study, method: str) -> Row:
     """A control step: of the replicates themselves, and in one run with the other methods."""
     row: Row = {"ms": study.own_time(method)}
     if (together := study.step_times.get(method)) is not None:
-        row |= {"step_ms": together, "times_robot_alone": together / study.step_times[ROBOT_ALONE]}
+        row |= {"step_ms": together.milliseconds, "times_robot_alone": together.times_robot_alone}
     return row
 
 
