@@ -59,7 +59,8 @@ def test_shipped_agent_serves_another_goal(shipped: Path, make_env: MakeEnv) -> 
 
 def test_wrapped_environment_has_no_shipped_agent(shipped: Path, make_env: MakeEnv) -> None:
     wrapped = gym.wrappers.RescaleAction(make_env(), np.float32(-0.5), np.float32(0.5))
-    assert FAMLE(wrapped, device="cpu", seed=0, **SMALL).dynamics is None
+    reward_fn = make_env().get_wrapper_attr("reward_fn")
+    assert FAMLE(wrapped, device="cpu", seed=0, reward_fn=reward_fn, **SMALL).dynamics is None
 
 
 def test_seed_decides_what_a_shipped_agent_does(shipped: Path, make_env: MakeEnv) -> None:
