@@ -211,8 +211,14 @@ def _run(some: Replicate | Fleet) -> tuple[Replicate | Fleet, list[Result] | str
 
 
 def _command(argv: list[str]) -> list[str]:
-    """The command line as a user types it, instead of the path of the file that it runs."""
-    script = Path(argv[0])
+    """The command line as a user types it, without the paths of a machine: of the file that it runs, and of results."""
+    script, arguments = Path(argv[0]), _without_out(argv[1:])
     if script.parent.name == "benchmarks":
-        return ["python", "-m", f"benchmarks.{script.stem}", *argv[1:]]
-    return [script.name, *argv[1:]] if script.suffix != ".py" else ["python", script.name, *argv[1:]]
+        return ["python", "-m", f"benchmarks.{script.stem}", *arguments]
+    return [script.name, *arguments] if script.suffix != ".py" else ["python", script.name, *arguments]
+
+
+def _without_out(arguments: list[str]) -> list[str]:
+    """The arguments without where the results go, which changes nothing of them."""
+    paths = {i + 1 for i, argument in enumerate(arguments) if argument == "--out"}
+    return [a for i, a in enumerate(arguments) if a.split("=")[0] != "--out" and i not in paths]

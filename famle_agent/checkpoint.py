@@ -101,7 +101,7 @@ def read_checkpoint(file: File) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 def save_agent(agent: ModelBasedAgent, file: File) -> None:
     """Writes all that an agent is: see :meth:`ModelBasedAgent.save`."""
-    if agent._env_spec is None and not hasattr(agent, "observation_space"):
+    if not hasattr(agent, "observation_space"):
         raise ValueError("This agent has no environment, so that there is nothing to save; make it with one.")
     live = agent._live
     meta = {

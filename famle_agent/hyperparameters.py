@@ -186,13 +186,13 @@ class Hyperparameters:
         Raises:
             TypeError: A key is no setting, or a value is of the wrong type.
         """
-        known = {field.name: field for field in dataclasses.fields(cls)}
+        known = typing.get_type_hints(cls)
         for key, value in values.items():
             if key not in known:
                 close = difflib.get_close_matches(key, known, n=1)
                 hint = f" Did you mean {close[0]!r}?" if close else ""
                 raise TypeError(f"There is no setting {key!r}.{hint} Settings: {', '.join(known)}.")
-            _check_type(key, value)
+            _check_type(key, value, known[key])
         return cls(**values)
 
     def to_dict(self) -> dict[str, Any]:
@@ -271,9 +271,8 @@ _KINDS: tuple[tuple[type, type, str], ...] = (
 """Types of settings, what is accepted for them (numpy's numbers too), and what to call that."""
 
 
-def _check_type(key: str, value: Any) -> None:
+def _check_type(key: str, value: Any, hint: Any) -> None:
     """Refuses a value of a type that a setting cannot have."""
-    hint = typing.get_type_hints(Hyperparameters)[key]
     kinds = typing.get_args(hint) or (hint,)
     if value is None and type(None) in kinds:
         return

@@ -10,7 +10,7 @@ import pytest
 from joblib import delayed, parallel_config
 
 from benchmarks import reacher
-from benchmarks.harness import Fleet, Replicate, ReplicateError, is_stored, load_results, run_replicates
+from benchmarks.harness import Fleet, Replicate, ReplicateError, is_stored, load_results, provenance, run_replicates
 from benchmarks.identification import accuracy, across_the_wrap
 from benchmarks.reporting.looks import look
 from benchmarks.reporting.statistics import first_crossing, interquartile_mean, solved_at
@@ -205,3 +205,9 @@ def test_identification_counts_right_answers(agent: FAMLE, transitions: Transiti
     right = accuracy(agent.dynamics, transitions, size=50, windows=2, wrap=False)
     swapped = replace(transitions, obs=transitions.obs[::-1].copy(), next_obs=transitions.next_obs[::-1].copy())
     assert accuracy(agent.dynamics, swapped, size=50, windows=2, wrap=False) < 0.5 < right <= 1.0
+
+
+@pytest.mark.parametrize("out", [["--out", "/somewhere/else"], ["--out=/somewhere/else"], []])
+def test_command_of_a_result_names_no_path_of_a_machine(out: list[str]) -> None:
+    argv = ["/a/machine/benchmarks/reacher.py", "--jobs", "1", *out, "--methods", "ppo"]
+    assert provenance(argv)["command"] == "python -m benchmarks.reacher --jobs 1 --methods ppo"

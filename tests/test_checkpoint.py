@@ -112,7 +112,7 @@ def test_seed_can_be_changed(agent_file: Path) -> None:
     assert not np.array_equal(one, other)
 
 
-def test_loaded_agent_counts_on_and_its_robot_starts_as_seeded(quick_agent: FAMLE, reload: Load) -> None:
+def test_loaded_agent_counts_on(quick_agent: FAMLE, reload: Load) -> None:
     quick_agent.learn(20)
     loaded = reload(quick_agent)
     assert loaded.num_timesteps == 20

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from famle_agent import AMPC, AMPCMAML, FAMLE, Hyperparameters
+from famle_agent import FAMLE, Hyperparameters
 from famle_agent.inner_loop import InnerLoop
 from famle_agent.joint_training import JointTraining
 from famle_agent.maml import MAML
@@ -22,13 +21,6 @@ from famle_agent.robots import known_robots, robot_of
 MODES = ("ours", "paper")
 every_robot = pytest.mark.parametrize("robot", list(known_robots()))
 every_mode = pytest.mark.parametrize("mode", MODES)
-RIVALS: dict[str, tuple[Any, dict[str, Any]]] = {
-    "ampc": (AMPC, {}),
-    "reptile": (AMPCMAML, {}),
-    "first-order-maml": (AMPCMAML, {"meta_learner": "first-order-maml"}),
-    "maml": (AMPCMAML, {"meta_learner": "maml"}),
-}
-every_rival = pytest.mark.parametrize("rival", RIVALS)
 
 
 @every_robot
@@ -161,54 +153,6 @@ def test_maml_gets_its_settings(first_order: bool) -> None:
     sizes = {"meta_batch_size": 3, "batch_size": 4, "query_size": 5}
     made = Hyperparameters(meta_learner=name, meta_iterations=7, meta_lr=0.1, **sizes).maml()
     assert made == MAML(iterations=7, meta_lr=0.1, **sizes, first_order=first_order)
-
-
-# --- rivals without embeddings ----------------------------------------------------------------------------
-
-
-def settings_of(rival: str, env: gym.Env[Any, Any], mode: str = "ours", **overrides: Any) -> Hyperparameters:
-    """Those of a rival's agent."""
-    cls, own = RIVALS[rival]
-    settings: Hyperparameters = cls(env, mode, device="cpu", pretrained=False, **own, **overrides).hyperparameters
-    return settings
-
-
-@every_rival
-@pytest.mark.parametrize("mode", [*MODES, "original"])
-def test_rivals_have_no_embeddings_in_any_mode(make_env: Callable[..., Any], rival: str, mode: str) -> None:
-    settings = settings_of(rival, make_env(), mode)
-    assert (settings.embedding_dim, settings.interaction_rank, settings.hazard) == (1, 0, 0)
-    assert {settings.gate_actions, settings.compose, settings.spread_members} == {False}
-    assert settings.embedding_lr == settings.joint_embedding_lr == settings.adaptation(seen=5).embedding_lr == 0
-    if rival == "ampc":
-        assert settings.rounds == settings.joint_iterations == settings.meta_iterations == 0
-    if mode != "ours":
-        assert settings.keep_adapting == (rival == "ampc")
-
-
-@pytest.mark.parametrize("robot", [name for name, robot in known_robots().items() if robot.rivals])
-def test_rivals_have_settings_of_their_own_in_one_mode(make_env: Callable[..., Any], robot: str) -> None:
-    entry = known_robots()[robot]
-    env = make_env(entry.env_id or "Pendulum-v1")
-    assert FAMLE(env, device="cpu", pretrained=False).hyperparameters == entry.hyperparameters("ours")
-    assert set(entry.rivals) == set(RIVALS)
-    for rival, (cls, own) in RIVALS.items():
-        tuned = entry.rivals[rival]
-        assert tuned
-        assert {name: getattr(settings_of(rival, env), name) for name in tuned} == tuned
-        assert settings_of(rival, env, "paper") == entry.hyperparameters("paper", **{**cls._implied, **own})
-        defaults = {name: getattr(Hyperparameters(), name) for name in tuned}
-        assert {name: getattr(settings_of(rival, env, **defaults), name) for name in tuned} == defaults
-
-
-def test_meta_learners_of_an_unknown_environment_have_settings(make_env: Callable[..., Any]) -> None:
-    for rival in ("first-order-maml", "maml"):
-        assert settings_of(rival, make_env("Pendulum-v1")).inner_loop().optimizer == "sgd"
-
-
-def test_meta_learner_of_a_rival_is_refused_by_the_others(make_env: Callable[..., Any]) -> None:
-    with pytest.raises((TypeError, ValueError), match="meta_learner"):
-        FAMLE(make_env(), device="cpu", meta_learner="maml")
 
 
 @given(

@@ -268,6 +268,24 @@ def test_processes_give_the_same_agent(make_agent: Make, uninterrupted: Dynamics
     assert_same(make_agent().meta_learn(SITUATIONS, n_jobs=2, folder=tmp_path).dynamics, uninterrupted)
 
 
+@pytest.mark.parametrize("iteration", [2, 8], ids=["in the first round", "in the second"])
+def test_interrupted_rounds_leave_the_agent_as_it_was(make_agent: Make, iteration: int) -> None:
+    agent = make_agent().meta_learn(SITUATIONS)
+    known, weights = agent.dynamics, copy.deepcopy(agent.dynamics.state_dict())
+
+    def stop(local: dict[str, Any], _: dict[str, Any]) -> bool:
+        if agent.num_timesteps == iteration:
+            raise KeyboardInterrupt
+        return True
+
+    with pytest.raises(KeyboardInterrupt):
+        agent.meta_learn(SITUATIONS[:2], callback=stop)
+    assert agent.dynamics is known
+    assert all(torch.equal(value, weights[name]) for name, value in agent.dynamics.state_dict().items())
+    assert agent.situations == tuple(SITUATIONS)
+    assert agent.num_timesteps == 0
+
+
 # --- a folder that does not fit ---------------------------------------------------------------------------
 
 
@@ -287,6 +305,8 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ({"seed": 1}, SITUATIONS, "seed"),
         ({}, SITUATIONS[:2], "situations"),
         ({"seed": 1}, SITUATIONS[::-1], "seed, situations"),
+        ({"angle_dims": (0,)}, SITUATIONS, "dimensions"),
+        ({"reward_fn": lambda obs, action, next_obs: next_obs[..., 0]}, SITUATIONS, "needs_reward_fn"),
     ],
 )
 def test_folder_of_another_run_is_refused(
@@ -322,34 +342,3 @@ def test_transitions_of_another_kind_are_not_taken_for_those_of_the_folder(
     )
     with pytest.raises(ValueError, match="differs in"):
         make_agent().meta_learn(others, folder=tmp_path)
-
-
-@pytest.mark.parametrize("iteration", [2, 8], ids=["in the first round", "in the second"])
-def test_interrupted_rounds_leave_the_agent_as_it_was(make_agent: Callable[..., FAMLE], iteration: int) -> None:
-    agent = make_agent().meta_learn(SITUATIONS)
-    known, weights = agent.dynamics, copy.deepcopy(agent.dynamics.state_dict())
-
-    def stop(local: dict[str, Any], _: dict[str, Any]) -> bool:
-        if agent.num_timesteps == iteration:
-            raise KeyboardInterrupt
-        return True
-
-    with pytest.raises(KeyboardInterrupt):
-        agent.meta_learn(SITUATIONS[:2], callback=stop)
-    assert agent.dynamics is known
-    assert all(torch.equal(value, weights[name]) for name, value in agent.dynamics.state_dict().items())
-    assert agent.situations == tuple(SITUATIONS)
-    assert agent.num_timesteps == 0
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"angle_dims": (0,)}, {"reward_fn": lambda obs, action, next_obs: next_obs[..., 0]}],
-    ids=["dims", "reward"],
-)
-def test_folder_is_of_one_robot_and_one_task(
-    make_agent: Callable[..., FAMLE], tmp_path: Path, change: dict[str, Any]
-) -> None:
-    make_agent(rounds=0).meta_learn(SITUATIONS, folder=tmp_path)
-    with pytest.raises(ValueError, match="holds a run that differs"):
-        make_agent(rounds=0, **change).meta_learn(SITUATIONS, folder=tmp_path)
