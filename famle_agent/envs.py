@@ -133,16 +133,17 @@ class SituationEnvs:
     situations: list[str]
 
 
-def situation_envs(env: VecEnv, envs: Sequence[EnvLike] | None) -> SituationEnvs:
+def situation_envs(env: VecEnv, envs: Sequence[EnvLike] | None, episode_length: int = 0) -> SituationEnvs:
     """One environment per training situation.
 
     Args:
         env: The agent's own environment; situations are put into new ones of its kind.
         envs: What the user gave; None takes the training situations that the environment names.
+        episode_length: Steps that an episode of each must be able to last; 0 asks for no more than their time limit.
 
     Raises:
         ValueError: No situation is given or known, the environment takes no ``situation``, the spaces of one differ
-            from the agent's, or one has a profile other than the simulator's.
+            from the agent's, one has a profile other than the simulator's, or ends its episodes too early.
     """
     if envs is None:
         envs = list(env_attribute(env, "training_situations", ()))
@@ -158,12 +159,13 @@ def situation_envs(env: VecEnv, envs: Sequence[EnvLike] | None) -> SituationEnvs
         )
     if len(envs) == 0:
         raise ValueError("meta_learn(envs) needs at least one environment, factory or Situation.")
-    sources, labels = [_source(env, item) for item in envs], list[str]()
+    sources, labels = [_source(env, item, episode_length) for item in envs], list[str]()
     for i, source in enumerate(sources):
         made = source if isinstance(source, gym.Env) else source()
         try:
             _check_same_spaces(made, env)
             _check_simulated(made)
+            _check_time_limit(made, episode_length)
             situation = _get(made, "situation", None)
         finally:
             if made is not source:
@@ -174,7 +176,7 @@ def situation_envs(env: VecEnv, envs: Sequence[EnvLike] | None) -> SituationEnvs
     return SituationEnvs(sources, labels)
 
 
-def _source(env: VecEnv, item: EnvLike) -> EnvSource:
+def _source(env: VecEnv, item: EnvLike, episode_length: int) -> EnvSource:
     if isinstance(item, gym.Env):
         return item
     if isinstance(item, (Situation, Mapping, str)):
@@ -184,7 +186,10 @@ def _source(env: VecEnv, item: EnvLike) -> EnvSource:
                 "Situations need a registered environment without wrappers; give environments or factories instead."
             )
         # Who only looks on, as the Monitor that Stable-Baselines3 puts around an environment, is no part of the robot.
-        return partial(_make_situation, replace(spec, additional_wrappers=()), item)
+        spec = replace(spec, additional_wrappers=())
+        if episode_length:
+            spec = replace(spec, max_episode_steps=episode_length)
+        return partial(_make_situation, spec, item)
     if not callable(item):
         raise ValueError(
             f"A situation is an environment, a factory of one, a Situation, a mapping or a name, got "
@@ -223,6 +228,16 @@ def _check_simulated(made: gym.Env[Any, Any]) -> None:
         raise ValueError(
             f"The profile {profile.name!r} stands for the robot that an agent is made for, and no agent meta-learns on "
             "it. Meta-learn on environments without a profile, then run the agent on this one."
+        )
+
+
+def _check_time_limit(made: gym.Env[Any, Any], episode_length: int) -> None:
+    limit = None if made.spec is None else made.spec.max_episode_steps
+    if limit is not None and limit < episode_length:
+        raise ValueError(
+            f"Simulated episodes should have {episode_length} steps (the setting episode_length), but the environment "
+            f"ends them after {limit}. Make it with gym.make(..., max_episode_steps={episode_length}), or give "
+            "episode_length=0 to take its own limit."
         )
 
 

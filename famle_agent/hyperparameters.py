@@ -26,6 +26,7 @@ class Hyperparameters:
     Attributes:
         transitions_per_situation: n, random transitions simulated in each training situation.
         action_hold: Steps that a random action is held while data are collected; the paper's is 1.
+        episode_length: Steps of an episode of simulated data, apart from the task's time limit; 0 takes that.
         rounds: How often the agent goes back to simulation, plans there in every training situation, and learns on
             from all transitions; 0 learns from random actions alone, as the paper does.
         round_transitions: Transitions simulated in each training situation in each such round.
@@ -102,6 +103,7 @@ class Hyperparameters:
 
     transitions_per_situation: int = 2000
     action_hold: int = 1
+    episode_length: int = 0
     rounds: int = 0
     round_transitions: int = 1000
     hidden: tuple[int, ...] = (200, 200)

@@ -124,7 +124,7 @@ class SimulationLearner(ModelBasedAlgorithm):
             ValueError: There are no situations, an environment's spaces differ from the agent's, or the folder is of a
                 run with other settings.
         """
-        source = envs if isinstance(envs, Transitions) else situation_envs(self._require_env(), envs)
+        source = envs if isinstance(envs, Transitions) else self._situation_envs(envs)
         rounds = 0 if isinstance(source, Transitions) else self.hyperparameters.rounds
         run = RunFolder(folder, {} if folder is None else self._fingerprint(source))  # which reads all transitions
         if not self._custom_logger:
@@ -197,7 +197,10 @@ class SimulationLearner(ModelBasedAlgorithm):
     ) -> Transitions:
         """Collects the random transitions that :meth:`meta_learn` learns from; arguments as there."""
         call = _Call(self.hyperparameters.rounds, RunFolder(None, {}), n_jobs, progress_bar)
-        return self._simulate(situation_envs(self._require_env(), envs), 0, call)
+        return self._simulate(self._situation_envs(envs), 0, call)
+
+    def _situation_envs(self, envs: Sequence[EnvLike] | None) -> SituationEnvs:
+        return situation_envs(self._require_env(), envs, self.hyperparameters.episode_length)
 
     def _simulate(self, envs: SituationEnvs, number: int, call: _Call) -> Transitions:
         """Random transitions in round 0, the agent's own planning after that."""
@@ -209,7 +212,17 @@ class SimulationLearner(ModelBasedAlgorithm):
             n, make_policy = settings.round_transitions, self._planning()
         seed, folder = self._draw_seed(), call.folder.transitions(number)
         with call.bar("Simulating", number, n * len(envs.sources), "step") as bar:
-            return collect(envs.sources, envs.situations, n, make_policy, seed, bar.update, call.n_jobs, folder)
+            return collect(
+                envs.sources,
+                envs.situations,
+                n,
+                make_policy,
+                seed,
+                bar.update,
+                call.n_jobs,
+                folder,
+                settings.episode_length,
+            )
 
     def _planning(self) -> MakePolicy:
         """What makes the agent plan with what it has learnt so far."""

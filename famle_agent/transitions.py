@@ -121,6 +121,7 @@ def collect(
     callback: Callable[[int], object] = lambda _: None,
     n_jobs: int = 1,
     folder: Path | None = None,
+    episode_length: int = 0,
 ) -> Transitions:
     """Runs a policy in the environment of each situation (lines 1 to 6 of Algorithm 1).
 
@@ -134,6 +135,7 @@ def collect(
         n_jobs: Parallel processes, -1 for one a core; environments that exist already stay in this one.
         folder: Where each situation's transitions are stored as soon as they are there. What it holds of an earlier
             run that was stopped is not collected again.
+        episode_length: Steps after which an episode is cut short; 0 leaves its end to the environment.
 
     Returns:
         The transitions; the step that a reset interrupts is no transition and is not among them.
@@ -143,7 +145,7 @@ def collect(
     """
     sequences = np.random.SeedSequence(seed).spawn(len(envs))
     tasks = [
-        _Task(i, env, situations[i], n, make_policy, sequence, folder)
+        _Task(i, env, situations[i], n, make_policy, sequence, folder, episode_length)
         for i, (env, sequence) in enumerate(zip(envs, sequences, strict=True))
     ]
     parts: dict[int, Transitions] = {}
@@ -171,6 +173,7 @@ class _Task:
     make_policy: MakePolicy
     sequence: np.random.SeedSequence
     folder: Path | None
+    episode_length: int
 
     def run(self) -> tuple[int, Transitions]:
         path = None if self.folder is None else self.folder / f"situation-{self.index:03d}.npz"
@@ -203,15 +206,16 @@ def _run_policy(env: gym.Env[Any, Any], task: _Task) -> Transitions:
     policy = task.make_policy(env, task.index, np.random.default_rng(task.sequence))
     rows: list[tuple[Any, Any, Any, Any]] = []
     obs = np.array(env.reset(seed=int(task.sequence.generate_state(1)[0]))[0])
-    episode_start = True
+    episode_start, age = True, 0
     while len(rows) < task.n:
         action = policy(obs, episode_start)
         next_obs, reward, terminated, truncated, _ = env.step(action)
         next_obs = np.array(next_obs)  # a copy: an environment may fill the same array again
         rows.append((obs, action, reward, next_obs))
-        obs, episode_start = next_obs, terminated or truncated
+        age += 1
+        obs, episode_start = next_obs, terminated or truncated or age == task.episode_length
         if episode_start:
-            obs = np.array(env.reset()[0])
+            obs, age = np.array(env.reset()[0]), 0
     columns = [np.array(column, dtype=np.float32)[None] for column in zip(*rows, strict=True)]
     obs_, action_, reward_, next_obs_ = columns
     return Transitions(obs_, action_, reward_, next_obs_, (task.situation,))
