@@ -39,7 +39,7 @@ def _learn_on(agent: FAMLE, task: Task) -> None:
     own = _of_the_test_robot(agent, task, others.obs.shape[1])
 
     agent.dynamics = _with_embeddings(model, torch.cat([model.embeddings.detach(), h], dim=1))
-    known, data = agent._begin_model(agent._in_model_units(_beside(others, own)), round_=1)
+    known, data = agent._begin_model(agent._in_model_units(_beside(others, own)), new=False)
     agent.hyperparameters.joint_training(1)(known, data, agent._generator)
     known.fit_noise(data)
     agent.dynamics = _with_embeddings(known, known.embeddings.detach()[:, -1:])

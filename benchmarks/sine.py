@@ -153,7 +153,7 @@ def meta_learn(learn: Reptile | MAML, data: Memory, n_situations: int, inner_loo
     """Meta-trains a fresh model of ``n_situations`` embeddings."""
     torch.manual_seed(seed)
     model = Dynamics(1, 0, n_situations, embedding_dim=4, hidden=HIDDEN, gate_actions=False)
-    model.fit_normalisation(data.obs, data.next_obs)
+    model.fit_normalisation(data.obs, data.action, data.next_obs)
     start = time.perf_counter()
     # The model's noise stays 1: of a single target, its size does not change which embedding is most likely.
     batch = model.encode(data.obs, data.action, data.next_obs)

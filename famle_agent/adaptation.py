@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from famle_agent.dynamics import Batch, Dynamics, Theta, expand
+from famle_agent.dynamics import Batch, Dynamics, Theta
 from famle_agent.inner_loop import Anchor, InnerLoop
 from famle_agent.memory import Memory, Sample, whole_memory
 
@@ -38,7 +38,7 @@ class Candidates:
     """The embeddings among which the most likely one is selected.
 
     Attributes:
-        h: (P, C, embedding_dim), those of the N training situations first.
+        h: (R * P, C, embedding_dim), those of the N training situations first; R is 1 where robots share networks.
         pairs: What each consists of, (C, 2): the situations i and j; j = 0 where it is i alone.
     """
 
@@ -85,18 +85,20 @@ class Candidates:
             (B, n, C); 0 for padding.
         """
         robots, n = data.weight.shape
-        members, size, _ = self.h.shape
+        owners, members, size = model.robots, model.members, self.h.shape[1]
+        sharing = robots // owners  # B robots share the networks, or each has its own
 
-        # Every robot's data under each candidate, side by side in each member's network: P networks, C * B * n rows.
+        # The data of all robots that share a network under each candidate, side by side: C * sharing * n rows.
         def rows(values: Tensor) -> Tensor:
-            flat = values.reshape(1, 1, robots * n, *values.shape[2:])
-            return flat.expand(members, size, *flat.shape[2:]).flatten(1, 2)
+            flat = values.reshape(owners, 1, 1, sharing * n, *values.shape[2:])
+            return flat.expand(owners, members, size, *flat.shape[3:]).flatten(2, 3).flatten(0, 1)
 
-        h = self.h.repeat_interleave(robots * n, dim=1)
+        h = self.h.repeat_interleave(sharing * n, dim=1)
         batch = Batch(rows(data.x), rows(data.y), rows(data.weight))
         log_p = model.log_likelihood(model.parameters_by_name(), h, batch)
+        log_p = log_p.view(owners, members, size, sharing, n).mean(dim=1)  # (R, C, sharing, n)
         # An observation beyond all measure would make every likelihood -inf and the posterior meaningless.
-        return log_p.view(members, size, robots, n).mean(dim=0).permute(1, 2, 0).clamp(min=-1e30)
+        return log_p.permute(0, 2, 3, 1).flatten(0, 1).clamp(min=-1e30)
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,7 @@ class Belief:
         h: h*, (B * P, embedding_dim).
         log_posterior: Log P(candidate | memory) but for a constant, (B, C).
         candidate: The candidate with which theta* and h* began, (B,).
+        diverged: How many adaptations of each robot left the finite numbers and were taken back, (B,).
         adaptations: How often the robots have adapted.
     """
 
@@ -115,6 +118,7 @@ class Belief:
     h: Tensor
     log_posterior: Tensor
     candidate: Tensor
+    diverged: Tensor
     adaptations: int = 0
 
     @property
@@ -142,15 +146,15 @@ class Belief:
 
         theta = {name: choose(value, other.theta[name]) for name, value in self.theta.items()}
         log_posterior = choose(self.log_posterior, other.log_posterior)
-        candidate = choose(self.candidate, other.candidate)
-        return Belief(theta, choose(self.h, other.h), log_posterior, candidate, self.adaptations)
+        candidate, diverged = choose(self.candidate, other.candidate), choose(self.diverged, other.diverged)
+        return Belief(theta, choose(self.h, other.h), log_posterior, candidate, diverged, self.adaptations)
 
 
 def prior(model: Dynamics, candidates: Candidates, robots: int) -> Belief:
     """What B robots believe before they have seen anything: theta_meta, and the first situation's embedding."""
-    theta = expand(model.parameters_by_name(), robots)
-    first = torch.zeros(robots, dtype=torch.long, device=model.embeddings.device)
-    return Belief(theta, model.embeddings_of(first).detach(), candidates.log_prior.expand(robots, -1), first)
+    none = torch.zeros(robots, dtype=torch.long, device=model.embeddings.device)
+    log_prior = candidates.log_prior.expand(robots, -1)
+    return Belief(model.theta_of(robots), model.embeddings_of(none), log_prior, candidate=none, diverged=none)
 
 
 def window_posterior(candidates: Candidates, memory: Memory) -> Tensor:
@@ -215,7 +219,8 @@ def adapt(
         model: Holds theta_meta and H_meta.
         candidates: The embeddings to select from.
         memory: D_M.
-        inner_loop: k steps of gradient descent; where they diverge, theta_meta and the embedding stay.
+        inner_loop: k steps of gradient descent; where they diverge, theta_meta and the embedding stay, and the belief
+            counts it.
         belief: Its posterior counts; theta* and h* are found anew.
         validation_size: As for :func:`descend`.
         spread: As for :func:`select`.
@@ -236,13 +241,14 @@ def select(model: Dynamics, candidates: Candidates, belief: Belief, spread: bool
             may be the case, and a robot that is stuck tries what it would do in another one.
     """
     robots, members = len(belief.log_posterior), model.members
+    networks = torch.arange(len(candidates.h), device=candidates.h.device).view(-1, members)  # (R, P)
     likeliest = belief.log_posterior.argmax(dim=1)
     likely = likeliest[:, None].expand(-1, members)
     if spread:
         likely = systematic_sample(belief.posterior, members, offset=belief.adaptations * _GOLDEN_RATIO % 1.0)
-    h_likely = candidates.h[torch.arange(members, device=likely.device), likely].flatten(0, 1)
-    theta_meta = expand(model.parameters_by_name(), robots)
-    return Belief(theta_meta, h_likely, belief.log_posterior, likeliest, belief.adaptations + 1)
+    h_likely = candidates.h[networks, likely].flatten(0, 1)
+    theta_meta = model.theta_of(robots)
+    return Belief(theta_meta, h_likely, belief.log_posterior, likeliest, belief.diverged, belief.adaptations + 1)
 
 
 @torch.no_grad()
@@ -258,7 +264,7 @@ def descend(
 
     Args:
         model: Says what the parameters mean.
-        start: Its theta and h are where the steps begin, and stay where they diverge.
+        start: Its theta and h are where the steps begin, and stay where they diverge, which is counted.
         memory: D_M.
         inner_loop: The k steps; theta_meta is their anchor.
         validation_size: The newest transitions, which no gradient step sees. Steps that do not make them more likely
@@ -276,13 +282,13 @@ def descend(
         theta = {name: _choose(better, value, start.theta[name]) for name, value in theta.items()}
         h = _choose(better, h, start.h)
     adapted = replace(start, theta=theta, h=h)
-    return adapted.where(adapted.is_finite(), start)  # steps that diverged are no steps
+    return adapted.where(adapted.is_finite(), replace(start, diverged=start.diverged + 1))
 
 
 def _anchor(model: Dynamics, memory: Memory) -> Anchor:
     """What the networks of B robots are drawn back to: theta_meta, (B * P, ...)."""
     n = memory.weight.sum(dim=1)
-    return Anchor(expand(model.parameters_by_name(), len(n)), n.repeat_interleave(model.members))
+    return Anchor(model.theta_of(len(n)), n.repeat_interleave(model.members))
 
 
 def _choose(rows: Tensor, mine: Tensor, theirs: Tensor) -> Tensor:

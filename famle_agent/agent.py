@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -17,7 +18,7 @@ from stable_baselines3.common.utils import safe_mean
 from torch import Tensor
 from typing_extensions import Self
 
-from famle_agent.adaptation import Belief
+from famle_agent.adaptation import Belief, descend
 from famle_agent.checkpoint import File, load_agent, load_pretrained, restore_agent, save_agent
 from famle_agent.dashboard import log_posterior
 from famle_agent.inner_loop import prepare_torch
@@ -50,6 +51,7 @@ class ModelBasedAgent(SimulationLearner):
         super()._setup_model()
         self.planner = self.hyperparameters.make_planner()
         self._live = self._served = None
+        self._warned_of_divergence = False
         if self.hyperparameters.adaptation(seen=1).steps:
             prepare_torch()
 
@@ -131,6 +133,8 @@ class ModelBasedAgent(SimulationLearner):
         posterior = self.posterior(state)
         self.logger.record("adapt/situation", max(posterior, key=lambda name: posterior[name]), exclude="tensorboard")
         log_posterior(self.logger, self.marginals(state))
+        self.logger.record("adapt/adaptations", state.belief.adaptations)
+        self.logger.record("adapt/diverged", int(state.belief.diverged.sum()))
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
 
@@ -267,11 +271,27 @@ class ModelBasedAgent(SimulationLearner):
         low, high = (bound.repeat_interleave(model.members, dim=0) for bound in memory.range())
         return bounded(simulator, low, high)
 
-    def _sample(self, belief: Belief) -> Sample:
-        """What a gradient step on the robot sees; the same for the same belief, as a deterministic agent promises."""
+    def _descend(self, start: Belief, memory: Memory) -> Belief:
+        """Line 7: k gradient steps from where a belief is. Warns of the first ones that diverge."""
+        settings, model = self.hyperparameters, self._require_dynamics()
+        steps, sample = settings.adaptation(memory.seen), self._sample(start.adaptations - 1)
+        adapted = descend(model, start, memory, steps, settings.validation_size, sample)
+        if steps.steps and not self._warned_of_divergence and (adapted.diverged > start.diverged).any():
+            self._warned_of_divergence = True
+            warnings.warn(
+                f"Adaptation {adapted.adaptations} diverged: its gradient steps left the finite numbers and were taken "
+                "back. Take smaller rates (adapt_lr, adapt_embedding_lr), or meta-learn on data that reach where the "
+                'robot is (action_hold, episode_length, rounds). info["famle"]["diverged"] and adapt/diverged count '
+                "them from here on.",
+                stacklevel=2,
+            )
+        return adapted
+
+    def _sample(self, number: int) -> Sample:
+        """What gradient steps of an adaptation see; the same for the same number, as a deterministic agent promises."""
         if not (size := self.hyperparameters.adapt_batch_size):
             return whole_memory
-        chance = torch.Generator(self.device).manual_seed(1_000_003 * (self.seed or 0) + belief.adaptations)
+        chance = torch.Generator(self.device).manual_seed(1_000_003 * (self.seed or 0) + number)
         return minibatches(size, chance)
 
     def _state_of(self, robots: int) -> OnlineState:
@@ -279,7 +299,7 @@ class ModelBasedAgent(SimulationLearner):
         if self._live is not None and self._live.robots == robots:
             return replace(self._live, last=None)
         model, M, W = self._require_dynamics(), self.hyperparameters.memory_size, self.hyperparameters.selection_window
-        C = self._prior(1).log_posterior.shape[1]
+        C = self._prior(robots).log_posterior.shape[1]
         return self._loop().begin(Memory.empty(robots, M, model.obs_dim, model.action_dim, C, self.device, W))
 
     # --- saving and loading -----------------------------------------------------------------------------

@@ -199,7 +199,7 @@ class ModelBasedAlgorithm(BaseAlgorithm):
     def _n_embeddings(self) -> int:
         """How many situations the model tells apart."""
 
-    def _new_dynamics(self) -> Dynamics:
+    def _new_dynamics(self, robots: int = 1) -> Dynamics:
         settings = self.hyperparameters
         return Dynamics(
             self.observation_space.shape[0],
@@ -212,6 +212,10 @@ class ModelBasedAlgorithm(BaseAlgorithm):
             interaction_rank=settings.interaction_rank,
             members=settings.members,
             degrees_of_freedom=settings.degrees_of_freedom,
+            activation=settings.activation,
+            output_limit=settings.output_limit,
+            normalise_actions=settings.normalise_actions,
+            robots=robots,
         ).to(self.device)
 
     def _new_reward(self) -> LearnedReward:

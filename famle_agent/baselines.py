@@ -9,9 +9,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation import Belief, descend
+from famle_agent.adaptation import Belief
 from famle_agent.agent import ModelBasedAgent
-from famle_agent.dynamics import expand
 from famle_agent.memory import Memory
 from famle_agent.online import OnlineState
 from famle_agent.simulation import Round
@@ -52,9 +51,9 @@ class _OneModelAgent(ModelBasedAgent):
 
     def _prior(self, robots: int) -> Belief:
         model = self._require_dynamics()
-        c = torch.zeros(robots, dtype=torch.long, device=self.device)
-        theta, h = expand(model.parameters_by_name(), robots), model.embeddings_of(c)
-        return Belief(theta, h, torch.zeros(robots, 1, device=self.device), c)
+        none = torch.zeros(robots, dtype=torch.long, device=self.device)
+        theta, h = model.theta_of(robots), model.embeddings_of(none)
+        return Belief(theta, h, torch.zeros(robots, 1, device=self.device), candidate=none, diverged=none)
 
     def _log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
         nothing = torch.zeros(len(obs), device=self.device)
@@ -67,9 +66,9 @@ class _OneModelAgent(ModelBasedAgent):
         """Theta* = k gradient steps on the last M transitions, from theta_meta (the paper's eq. 3) or going on."""
         settings = self.hyperparameters
         start = belief if settings.keep_adapting else self._prior(len(memory.weight))
-        start = replace(start, adaptations=belief.adaptations + 1)
-        model, steps = self._require_dynamics(), settings.adaptation(memory.seen)
-        return memory, descend(model, start, memory, steps, settings.validation_size, self._sample(belief))
+        return memory, self._descend(
+            replace(start, diverged=belief.diverged, adaptations=belief.adaptations + 1), memory
+        )
 
 
 class AMPC(_OneModelAgent):
@@ -99,7 +98,7 @@ class AMPC(_OneModelAgent):
 
     def _learn_model(self, transitions: Transitions, round_: Round) -> None:
         """A network with random weights."""
-        self._begin_model(transitions, round_.number)
+        self._begin_model(transitions, new=round_.number == 0)
 
 
 class AMPCMAML(_OneModelAgent):

@@ -242,7 +242,8 @@ def _restore_tensors(agent: ModelBasedAgent, tensors: dict[str, Tensor], live: d
         return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
     if weights := part("dynamics"):
-        agent.dynamics = agent._new_dynamics()
+        robots = max(1, len(weights["embeddings"]) // agent.hyperparameters.members)
+        agent.dynamics = agent._new_dynamics(robots)
         agent.dynamics.load_state_dict(weights)
     if weights := part("reward"):
         agent._learned_reward = agent._new_reward()

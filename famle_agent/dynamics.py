@@ -1,7 +1,8 @@
 """The situation-conditioned dynamics model p_theta(s' | s, a, h) (the paper's section IV-A).
 
 Every function takes a leading axis B of independent networks: situations while meta-learning, robots while deployed,
-and in each of these the P members of an ensemble, which see the same transitions (index = robot * P + member).
+and in each of these the P members of an ensemble, which see the same transitions (index = robot * P + member). Robots
+share what was meta-learned, but for a model made by :meth:`Dynamics.for_robots`.
 Parameters are stacked along it, so that B networks cost one batched matrix product a layer.
 """
 
@@ -12,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -69,6 +71,9 @@ class Dynamics(nn.Module):
 
     in which a sensor that is turned is linear in h. What is linear in h adds up: two faults are the sum of theirs.
 
+    With an ``output_limit`` L, the normalised change is L tanh(z) of the network's last layer z, as in the authors'
+    public code.
+
     Args:
         obs_dim: Number of observation dimensions.
         action_dim: Number of action dimensions.
@@ -83,14 +88,21 @@ class Dynamics(nn.Module):
         members: P, independent networks with embeddings of their own; 1 is the paper's.
         degrees_of_freedom: Of a Student-t likelihood, which forgives what no model predicts, contacts above all;
             0 is a Gaussian (the paper's).
+        activation: Of the hidden layers, ``"silu"`` or ``"relu"``.
+        output_limit: L; 0 leaves the output free.
+        normalise_actions: Whether the network sees actions of zero mean and unit deviation over the data, instead of
+            actions in [-1, 1].
+        robots: R, robots with networks of their own; 1 is a model that any number of robots share.
 
     Attributes:
-        theta: Parameters of the members by name, (P, ...).
-        embeddings: H, the embedding of each training situation, (P, N, embedding_dim).
+        theta: Parameters of the members by name, (R * P, ...).
+        embeddings: H, the embedding of each training situation, (R * P, N, embedding_dim).
     """
 
     input_mean: Tensor
     input_std: Tensor
+    action_mean: Tensor
+    action_std: Tensor
     target_mean: Tensor
     target_std: Tensor
     noise_std: Tensor
@@ -109,36 +121,45 @@ class Dynamics(nn.Module):
         interaction_rank: int = 0,
         members: int = 1,
         degrees_of_freedom: float = 0.0,
+        activation: Literal["silu", "relu"] = "silu",
+        output_limit: float = 0.0,
+        normalise_actions: bool = False,
+        robots: int = 1,
     ) -> None:
         super().__init__()
-        self.obs_dim, self.action_dim = obs_dim, action_dim
+        self.obs_dim, self.action_dim, self.robots = obs_dim, action_dim, robots
+        self.activation, self.output_limit, self.normalise_actions = activation, output_limit, normalise_actions
         self.gate_actions, self.interaction_rank = gate_actions, interaction_rank
         self.degrees_of_freedom = degrees_of_freedom
         self.layout = ObservationLayout(obs_dim, tuple(angle_dims), tuple(quaternion_dims), tuple(pose_dims))
         self.n_features = self.layout.n_features
         self.n_layers = len(hidden) + 1
 
+        networks = robots * members
         sizes = [self.n_features + action_dim, *hidden, obs_dim]
         theta = {}
         for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
-            theta[f"weight_{layer}"] = torch.randn(members, fan_in, fan_out) / math.sqrt(fan_in)
-            theta[f"bias_{layer}"] = torch.zeros(members, fan_out)
-        theta["embedding"] = torch.randn(members, embedding_dim, sizes[1]) / math.sqrt(sizes[0] + embedding_dim)
+            theta[f"weight_{layer}"] = torch.randn(networks, fan_in, fan_out) / math.sqrt(fan_in)
+            theta[f"bias_{layer}"] = torch.zeros(networks, fan_out)
+        theta["embedding"] = torch.randn(networks, embedding_dim, sizes[1]) / math.sqrt(sizes[0] + embedding_dim)
         if gate_actions:
-            theta["gate"] = torch.randn(members, embedding_dim, action_dim) / math.sqrt(embedding_dim)
+            theta["gate"] = torch.randn(networks, embedding_dim, action_dim) / math.sqrt(embedding_dim)
         if interaction_rank:
             shapes = {"input": (sizes[0], interaction_rank), "situation": (embedding_dim, interaction_rank)}
             shapes["output"] = (interaction_rank, sizes[1])
             for name, (fan_in, fan_out) in shapes.items():
-                theta[f"interaction_{name}"] = torch.randn(members, fan_in, fan_out) / math.sqrt(fan_in)
+                theta[f"interaction_{name}"] = torch.randn(networks, fan_in, fan_out) / math.sqrt(fan_in)
         self.theta = nn.ParameterDict(theta)
-        self.embeddings = nn.Parameter(torch.randn(members, n_situations, embedding_dim))
+        self.embeddings = nn.Parameter(torch.randn(networks, n_situations, embedding_dim))
 
         self.register_buffer("input_mean", torch.zeros(self.n_features))
         self.register_buffer("input_std", torch.ones(self.n_features))
+        # Where actions are not normalised these stay as they are, and files do not have them.
+        self.register_buffer("action_mean", torch.zeros(action_dim), persistent=normalise_actions)
+        self.register_buffer("action_std", torch.ones(action_dim), persistent=normalise_actions)
         self.register_buffer("target_mean", torch.zeros(obs_dim))
         self.register_buffer("target_std", torch.ones(obs_dim))
-        self.register_buffer("noise_std", torch.ones(members, obs_dim))
+        self.register_buffer("noise_std", torch.ones(networks, obs_dim))
 
     @property
     def n_situations(self) -> int:
@@ -148,11 +169,23 @@ class Dynamics(nn.Module):
     @property
     def members(self) -> int:
         """P, the networks of the ensemble."""
-        return self.embeddings.shape[0]
+        return self.embeddings.shape[0] // self.robots
 
     def parameters_by_name(self) -> Theta:
-        """Theta as plain tensors without gradient, (P, ...)."""
+        """Theta as plain tensors without gradient, (R * P, ...)."""
         return {name: value.detach() for name, value in self.theta.items()}
+
+    def theta_of(self, robots: int) -> Theta:
+        """Theta of B robots, (B * P, ...).
+
+        Raises:
+            ValueError: The model is of other robots.
+        """
+        if self.robots == 1:
+            return expand(self.parameters_by_name(), robots)
+        if robots != self.robots:
+            raise ValueError(f"The model has networks for {self.robots} robots, not for {robots}.")
+        return self.parameters_by_name()
 
     def with_members(self, count: int, first: int = 0) -> Dynamics:
         """A model of ``count`` of the members, from the one of index ``first`` on.
@@ -160,9 +193,28 @@ class Dynamics(nn.Module):
         Raises:
             ValueError: There are not as many.
         """
+        if self.robots > 1:
+            raise ValueError("A model of robots with networks of their own has no members to give.")
         if not (1 <= count <= self.members and 0 <= first <= self.members - count):
             raise ValueError(f"The ensemble has 1 to {self.members} members to give, not {count} from {first} on.")
-        chosen = slice(first, first + count)
+        return self._with_networks(torch.arange(first, first + count))
+
+    def for_robots(self, networks: Sequence[int]) -> Dynamics:
+        """A model of as many robots, each of which has one of the members for its own network.
+
+        Args:
+            networks: The member of each robot.
+
+        Raises:
+            ValueError: There is no such member.
+        """
+        if self.robots > 1 or not all(0 <= network < self.members for network in networks):
+            raise ValueError(f"There are members 0 to {self.members - 1} to give to robots, not {list(networks)}.")
+        part = self._with_networks(torch.tensor(networks))
+        part.robots = len(networks)
+        return part
+
+    def _with_networks(self, chosen: Tensor) -> Dynamics:
         part = copy.deepcopy(self)
         for owner, names in ((part.theta, list(self.theta)), (part, ["embeddings"])):
             for name in names:
@@ -176,7 +228,11 @@ class Dynamics(nn.Module):
 
     def embeddings_of(self, c: Tensor) -> Tensor:
         """The embeddings of situations c (B,) in every member, (B * P, embedding_dim)."""
-        return self.embeddings.detach()[:, self.embedding_index(c)].transpose(0, 1).flatten(0, 1)
+        index = self.embedding_index(c)
+        if self.robots == 1:
+            return self.embeddings.detach()[:, index].transpose(0, 1).flatten(0, 1)
+        own = index.repeat_interleave(self.members)
+        return self.embeddings.detach()[torch.arange(len(own), device=own.device), own]
 
     # --- data -------------------------------------------------------------------------------------------
 
@@ -188,9 +244,12 @@ class Dynamics(nn.Module):
         """The change of the state, (..., obs_dim)."""
         return self.layout.change(obs, next_obs)
 
-    def fit_normalisation(self, obs: Tensor, next_obs: Tensor) -> None:
-        """Takes means and deviations over all leading axes of the data."""
-        for name, values in (("input", self.features(obs)), ("target", self.targets(obs, next_obs))):
+    def fit_normalisation(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> None:
+        """Takes means and deviations over all leading axes of the data, (..., dim) each."""
+        named = {"input": self.features(obs), "target": self.targets(obs, next_obs)}
+        if self.normalise_actions:
+            named["action"] = action
+        for name, values in named.items():
             flat = values.flatten(0, -2)
             std = flat.std(dim=0) if flat.shape[1] else flat.mean(dim=0)  # a model may see no more than the actions
             # A dimension that never varies carries nothing and must not be blown up.
@@ -202,6 +261,8 @@ class Dynamics(nn.Module):
         features = (self.features(obs) - self.input_mean) / self.input_std
         targets = (self.targets(obs, next_obs) - self.target_mean) / self.target_std
         weight = torch.ones(obs.shape[:-1], device=obs.device) if weight is None else weight
+        if self.normalise_actions:
+            action = (action - self.action_mean) / self.action_std
         return Batch(torch.cat([features, action], dim=-1), targets, weight)
 
     # --- the network ------------------------------------------------------------------------------------
@@ -226,13 +287,16 @@ class Dynamics(nn.Module):
             layers.append((theta[f"weight_{layer}"], theta[f"bias_{layer}"][:, None]))
         return layers
 
-    @staticmethod
-    def forward(network: Network, x: Tensor) -> Tensor:
+    def forward(self, network: Network, x: Tensor) -> Tensor:
         """Mean of the normalised targets, (B, n, obs_dim), for normalised inputs (B, n, inputs)."""
         for weight, bias in network[:-1]:
-            x = F.silu(torch.baddbmm(bias, x, weight), inplace=not torch.is_grad_enabled())
+            x = self._activate(torch.baddbmm(bias, x, weight), inplace=not torch.is_grad_enabled())
         weight, bias = network[-1]
-        return torch.baddbmm(bias, x, weight)
+        z = torch.baddbmm(bias, x, weight)
+        return self.output_limit * z.tanh() if self.output_limit else z
+
+    def _activate(self, z: Tensor, inplace: bool = False) -> Tensor:
+        return F.silu(z, inplace=inplace) if self.activation == "silu" else F.relu(z, inplace=inplace)
 
     def predict(self, theta: Theta, h: Tensor, x: Tensor) -> Tensor:
         """As :meth:`forward`, with an embedding for each row: the same networks see many situations at once.
@@ -251,7 +315,7 @@ class Dynamics(nn.Module):
             z = torch.baddbmm(z, interaction, theta["interaction_output"])
         layers = range(1, self.n_layers)
         rest = [(theta[f"weight_{layer}"], theta[f"bias_{layer}"][:, None]) for layer in layers]
-        return self.forward(rest, F.silu(z))
+        return self.forward(rest, self._activate(z))
 
     def loss(self, theta: Theta, h: Tensor, batch: Batch) -> Tensor:
         """Negative log-likelihood L(theta, h) of unit variance, constants left out, (B,); eq. 6 of the paper.
@@ -271,7 +335,7 @@ class Dynamics(nn.Module):
 
         Arguments as for :meth:`loss`.
         """
-        noise = self.noise_std.repeat(len(batch.x) // self.members, 1)[:, None]
+        noise = self.noise_std.repeat(len(batch.x) // len(self.noise_std), 1)[:, None]
         residual = (self.predict(theta, _rows(h), batch.x) - batch.y) / noise
         return (self._log_density(residual) - noise.log()).sum(dim=-1) * batch.weight
 
@@ -313,10 +377,15 @@ class Simulator:
         (first_weight, first_bias), (last_weight, last_bias) = network[0], network[-1]
         from_features = first_weight[:, : model.n_features] / model.input_std[:, None]
         bias = first_bias - (model.input_mean @ from_features)[:, None]
-        weights = [model.layout.weights_for_inputs(from_features), first_weight[:, model.n_features :]]
-        first = torch.cat(weights, dim=1), bias
-        last = (last_weight * model.target_std, last_bias * model.target_std + model.target_mean)
-        self._network = [first, *network[1:-1], last]
+        from_actions = first_weight[:, model.n_features :]
+        if model.normalise_actions:
+            from_actions = from_actions / model.action_std[:, None]
+            bias = bias - (model.action_mean @ from_actions)[:, None]
+        first = torch.cat([model.layout.weights_for_inputs(from_features), from_actions], dim=1), bias
+        if not model.output_limit:  # a limit stands between the last layer and the units of the environment
+            last_weight = last_weight * model.target_std
+            last_bias = last_bias * model.target_std + model.target_mean
+        self._network = [first, *network[1:-1], (last_weight, last_bias)]
 
     def __call__(self, obs: Tensor, action: Tensor) -> Tensor:
         """Predicts the next observations, (B, n, obs_dim), angles not wrapped.
@@ -327,6 +396,8 @@ class Simulator:
         """
         inputs = torch.cat([*self._model.layout.inputs(obs), action], dim=-1)
         change = self._model.forward(self._network, inputs)
+        if self._model.output_limit:
+            change = change * self._model.target_std + self._model.target_mean
         return self._model.layout.advance(obs, change)
 
 

@@ -13,7 +13,6 @@ from famle_agent.adaptation import (
     Belief,
     Candidates,
     better_explained,
-    descend,
     filtered_posterior,
     prior,
     select,
@@ -102,13 +101,12 @@ class FAMLE(ModelBasedAgent):
 
     def _adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
         """Algorithm 2, lines 6 and 7: the most likely embedding, then k gradient steps on theta and h."""
-        settings, model, start = self.hyperparameters, self._require_dynamics(), self._selected(belief)
+        settings, start = self.hyperparameters, self._selected(belief)
         if settings.keep_adapting:
             changed = better_explained(memory, start.candidate) & (start.candidate != belief.candidate)
             memory = memory.begun_anew(changed, settings.selection_window, start.candidate)
             start = start.where(changed, replace(belief, adaptations=start.adaptations))
-        steps = settings.adaptation(memory.seen)
-        return memory, descend(model, start, memory, steps, settings.validation_size, self._sample(belief))
+        return memory, self._descend(start, memory)
 
     def _simulator(self, belief: Belief, memory: Memory) -> Model:
         """Where steps go on, they may lead astray for a while: until they are of use, the embedding alone plans."""

@@ -30,6 +30,8 @@ class Hyperparameters:
         rounds: How often the agent goes back to simulation, plans there in every training situation, and learns on
             from all transitions; 0 learns from random actions alone, as the paper does.
         round_transitions: Transitions simulated in each training situation in each such round.
+        restart_last_round: Whether the last round learns a new model from all transitions, instead of going on with the
+            one that planned; so do the authors, whose planned transitions come from networks of their own.
         hidden: Width of each hidden layer of the dynamics model.
         embedding_dim: Size of a situation embedding h.
         egocentric: Whether the model sees a robot's pose on a floor from the robot itself, where the environment names
@@ -37,6 +39,10 @@ class Hyperparameters:
         gate_actions: Whether h scales the actions inside the model; the paper's network only concatenates it.
         interaction_rank: Rank of the products of h and the inputs in the first layer; 0 is the paper's network.
         members: Networks of the ensemble, each with its own embeddings; 1 is the paper's.
+        activation: Of the model's hidden layers, ``"silu"`` or, as the authors' public code, ``"relu"``.
+        output_limit: L of a predicted change L tanh(z), in deviations of the data's; 0, the paper's, has no limit, the
+            authors' code 10.
+        normalise_actions: Whether the model sees actions of zero mean and unit deviation, as the authors' code does.
         degrees_of_freedom: Of the Student-t likelihood that tells situations apart; 0 is a Gaussian (the paper's).
         joint_iterations: Steps of training on all situations at once before Algorithm 1; 0 is the paper's.
         round_iterations: The same in each later round.
@@ -106,12 +112,16 @@ class Hyperparameters:
     episode_length: int = 0
     rounds: int = 0
     round_transitions: int = 1000
+    restart_last_round: bool = False
     hidden: tuple[int, ...] = (200, 200)
     embedding_dim: int = 5
     egocentric: bool = True
     gate_actions: bool = True
     interaction_rank: int = 0
     members: int = 1
+    activation: Literal["silu", "relu"] = "silu"
+    output_limit: float = 0.0
+    normalise_actions: bool = False
     degrees_of_freedom: float = 0.0
     joint_iterations: int = 0
     round_iterations: int = 0
@@ -302,6 +312,7 @@ _AT_LEAST_ONE = {
 }
 """The other numbers may be 0."""
 _CHOICES = {
+    "activation": ("silu", "relu"),
     "meta_learner": ("reptile", "first-order-maml", "maml"),
     "inner_optimizer": ("sgd", "adam"),
     "adapt_optimizer": (None, "sgd", "adam"),

@@ -55,7 +55,7 @@ class OnlineState:
         """All but :attr:`last` and the counts, for a checkpoint."""
         tensors = {f"theta.{name}": value for name, value in self.belief.theta.items()}
         tensors |= {f"memory.{name}": value for name, value in vars(self.memory).items()}
-        belief = {name: getattr(self.belief, name) for name in ("h", "log_posterior", "candidate")}
+        belief = {name: getattr(self.belief, name) for name in ("h", "log_posterior", "candidate", "diverged")}
         return tensors | belief | {"plan": self.plan}
 
     @classmethod
@@ -65,7 +65,9 @@ class OnlineState:
         def part(prefix: str) -> dict[str, Tensor]:
             return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
-        belief = Belief(part("theta."), tensors["h"], tensors["log_posterior"], tensors["candidate"], adaptations)
+        h, log_posterior, candidate = (tensors[name] for name in ("h", "log_posterior", "candidate"))
+        diverged = tensors.get("diverged", torch.zeros_like(candidate))  # files of version 0.1 do not count
+        belief = Belief(part("theta."), h, log_posterior, candidate, diverged, adaptations)
         return cls(Memory(**part("memory.")), belief, tensors["plan"], steps=steps, adapted_at=adapted_at)
 
 
@@ -150,5 +152,6 @@ class OnlineLoop:
             state = replace(state, memory=memory, belief=belief, adapted_at=state.steps)
         if self.forget_at_reset:
             memory = replace(state.memory, weight=state.memory.weight * kept[:, None])
-            state = replace(state, memory=memory, belief=state.belief.where(kept, self.prior(state.robots)))
+            prior = replace(self.prior(state.robots), diverged=state.belief.diverged)
+            state = replace(state, memory=memory, belief=state.belief.where(kept, prior))
         return replace(state, plan=torch.where(kept[:, None, None], state.plan, 0.0))

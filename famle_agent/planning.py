@@ -15,7 +15,8 @@ from torch import Tensor
 
 __all__ = ["ICEM", "MPPI", "Judge", "Model", "Planner", "RandomShooting", "RewardFn", "bounded", "imagine", "shift"]
 
-_CANDIDATES_AT_ONCE = 2500
+_CANDIDATES_AT_ONCE = {"cpu": 2500, "cuda": 1_000_000}
+"""By kind of device: what stays in a processor's cache over the whole horizon, or fills a GPU."""
 
 Judge = Callable[[Tensor], Tensor]
 """Candidate actions (B, N, H, action_dim) -> the return of each, (B, N)."""
@@ -44,8 +45,8 @@ def imagine(model: Model, reward_fn: RewardFn, obs: Tensor, actions: Tensor, mem
         The return of each candidate, (B, N); -inf where a model left the finite numbers.
     """
     obs, actions = (values.repeat_interleave(members, dim=0) for values in (obs, actions))
-    # A few thousand candidates at a time stay in the processor's cache over the whole horizon.
-    parts = torch.split(actions, max(1, _CANDIDATES_AT_ONCE // len(actions)), dim=1)
+    at_once = _CANDIDATES_AT_ONCE.get(obs.device.type, 2500)
+    parts = torch.split(actions, max(1, at_once // len(actions)), dim=1)
     returns = torch.cat([_imagine(model, reward_fn, obs, part) for part in parts], dim=1)
     returns = torch.nan_to_num(returns, nan=-math.inf, posinf=-math.inf, neginf=-math.inf)
     return returns.view(-1, members, returns.shape[1]).mean(dim=1)

@@ -26,13 +26,13 @@ class Robot:
         env_id: The Gymnasium id; empty for the settings of an unknown environment.
         modes: Settings by mode: ``paper`` is the paper's text, ``original`` the authors' public code, ``ours`` what we
             found to be best.
-        rivals: What the agents without embeddings change of ``ours``, by the name of the method; tuned for them.
+        rivals: What the agents without embeddings change of a mode, by mode and name of the method; tuned for them.
     """
 
     name: str
     env_id: str
     modes: dict[str, dict[str, Any]]
-    rivals: dict[str, dict[str, Any]]
+    rivals: dict[str, dict[str, dict[str, Any]]]
 
     @property
     def pretrained(self) -> Traversable | None:
@@ -54,7 +54,7 @@ class Robot:
         """
         if mode not in self.modes:
             raise ValueError(f"mode must be one of {', '.join(self.modes)}, got {mode!r}.")
-        tuned = self.rivals.get(rival, {}) if mode == "ours" else {}
+        tuned = self.rivals.get(mode, {}).get(rival, {})
         return Hyperparameters.from_dict({**self.modes[mode], **tuned, **overrides})
 
 

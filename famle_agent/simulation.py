@@ -280,18 +280,21 @@ class SimulationLearner(ModelBasedAlgorithm):
         hooks.update_locals(locals())
         return hooks.on_step()
 
-    def _begin_model(self, transitions: Transitions, round_: int) -> tuple[Dynamics, Batch]:
-        """The model, a new one in round 0, and the transitions as it sees them."""
+    def _begin_model(self, transitions: Transitions, new: bool) -> tuple[Dynamics, Batch]:
+        """The model, be it a new one or the one so far, and the transitions as it sees them."""
         obs, action, next_obs = self._tensors(transitions.obs, transitions.action, transitions.next_obs)
-        if round_ == 0:
+        if new:
             self.dynamics = self._new_dynamics()
-            self.dynamics.fit_normalisation(obs, next_obs)
+            self.dynamics.fit_normalisation(obs, action, next_obs)
         model = self._require_dynamics()
         return model, model.encode(obs, action, next_obs)
 
     def _meta_train(self, transitions: Transitions, round_: Round, learn: Reptile | MAML) -> Dynamics:
         """Trains the model on all situations at once, and in the last round meta-learns from there."""
-        settings, (model, data) = self.hyperparameters, self._begin_model(transitions, round_.number)
+        settings = self.hyperparameters
+        model, data = self._begin_model(
+            transitions, round_.number == 0 or (round_.last and settings.restart_last_round)
+        )
 
         def log_joint(loss: float) -> bool:
             return round_.on_iteration({"meta/joint_loss": loss})

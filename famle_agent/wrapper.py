@@ -21,7 +21,7 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
 
     Each step's ``info["famle"]`` says what the agent believes: ``situation``, the most likely training situation;
     ``probability``, how likely it is among them; ``posterior``, all of them by name; ``adaptations``, how often the
-    agent has adapted. The memory outlasts a reset, as damage does; ``agent.forget()`` empties it.
+    agent has adapted, and ``diverged``, how often its gradient steps left the finite numbers and were taken back. The memory outlasts a reset, as damage does; ``agent.forget()`` empties it.
 
     Args:
         env: The robot's environment.
@@ -68,11 +68,12 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
         return obs, reward, terminated, truncated, info | {"famle": self._belief()}
 
     def _belief(self) -> dict[str, Any]:
-        posterior = self.agent.posterior()
+        posterior, belief = self.agent.posterior(), self.agent.belief
         situation = max(posterior, key=lambda name: posterior[name])
         return {
             "situation": situation,
             "probability": posterior[situation],
             "posterior": posterior,
-            "adaptations": self.agent.belief.adaptations,
+            "adaptations": belief.adaptations,
+            "diverged": int(belief.diverged.sum()),
         }

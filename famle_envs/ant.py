@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import pybullet
@@ -61,16 +61,20 @@ class AntEnv(BulletEnv):
     ## Situations
     ``motor_gain`` (weak, dead or reversed), ``locked_joints``, ``orientation_error`` (of the measured yaw; velocities
     are measured as they are) and ``friction`` (of the floor). :attr:`training_situations` holds the paper's 20.
+    The paper speaks of an error in the measured orientation, which is added to the yaw here. The authors' public code
+    gives the error instead of the yaw, so that the robot never sees where it is heading; see ``yaw_sensor``.
 
     Args:
         control_rate: Control steps per second, of four physics steps each: 60.6 as in the authors' code, or 100 as
             in the paper.
         terminate_when_fallen: Whether a fall ends the episode.
+        yaw_sensor: ``"offset"`` measures the yaw plus the ``orientation_error``, ``"stuck"`` that error alone whatever
+            the yaw is, which is 0 for the intact robot: the authors' public code.
         situation: See :class:`BulletEnv`.
         render_mode: See :class:`BulletEnv`.
 
     Raises:
-        ValueError: The control rate is outside 50 to 500 Hz; and as :class:`BulletEnv`.
+        ValueError: The control rate is outside 50 to 500 Hz, or the yaw sensor is unknown; and as :class:`BulletEnv`.
 
     Example:
         >>> import gymnasium as gym, famle_envs
@@ -102,9 +106,13 @@ class AntEnv(BulletEnv):
         *,
         control_rate: float = CONTROL_RATE,
         terminate_when_fallen: bool = False,
+        yaw_sensor: Literal["offset", "stuck"] = "offset",
         situation: Situation | Mapping[str, Any] | str | None = None,
         render_mode: str | None = None,
     ) -> None:
+        if yaw_sensor not in ("offset", "stuck"):
+            raise ValueError(f'yaw_sensor must be "offset" or "stuck", got {yaw_sensor!r}.')
+        self.yaw_sensor = yaw_sensor
         control_rate = number_within("control_rate", control_rate, 50.0, 500.0, "Hz")
         self.time_step = 1.0 / control_rate  # type: ignore[misc]  # each ant has a rate of its own
         self.metadata = {**self.metadata, "render_fps": round(control_rate)}
@@ -141,6 +149,16 @@ class AntEnv(BulletEnv):
         upright = 1.0 - 2.0 * (x * x + y * y)
         return self.reward_fn(obs, action, next_obs) - 4.0 * (0.8 - upright).clip(min=0.0)
 
+    def survival_reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
+        """The reward, less 2 m/s where the torso is below 0.26 m: what the planner of the authors' public code maximises.
+
+        Args:
+            obs: Observations, (..., 27). Not used.
+            action: Actions, (..., 8). Not used.
+            next_obs: Observations one step later, (..., 27); a NumPy array or a torch tensor.
+        """
+        return self.reward_fn(obs, action, next_obs) - 2.0 * (next_obs[..., 0] < FALLEN_HEIGHT)
+
     @classmethod
     def sample_situation(cls, rng: np.random.Generator) -> Situation:
         """Draws an unseen situation of the paper's kind: a dead joint and an error of the measured yaw together.
@@ -170,8 +188,6 @@ class AntEnv(BulletEnv):
             self._robot, self.joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * N_JOINTS, physicsClientId=self._world
         )
         self._torque = MAX_TORQUE * np.array(self._situation.motor_gain)
-        half = 0.5 * self._situation.orientation_error
-        self._yaw_error = (math.cos(half), math.sin(half))
         pybullet.changeDynamics(
             self._floor, -1, lateralFriction=FLOOR_FRICTION * self._situation.friction, physicsClientId=self._world
         )
@@ -196,8 +212,11 @@ class AntEnv(BulletEnv):
         )
 
     def _measured(self, x: float, y: float, z: float, w: float) -> tuple[float, float, float, float]:
-        """The quaternion turned about the vertical by the error of the yaw sensor, with w >= 0."""
-        c, s = self._yaw_error
+        """The quaternion turned about the vertical by what is wrong with the yaw sensor, with w >= 0."""
+        turn = self._situation.orientation_error
+        if self.yaw_sensor == "stuck":
+            turn -= math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        c, s = math.cos(0.5 * turn), math.sin(0.5 * turn)
         turned = (c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z)
         return turned if turned[3] >= 0.0 else (-turned[0], -turned[1], -turned[2], -turned[3])
 

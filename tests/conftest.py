@@ -118,7 +118,8 @@ def tiny_budgets(monkeypatch: pytest.MonkeyPatch) -> None:
 def small_reacher(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Shrinks what the benchmark's agents for the reacher spend, and its episodes; all in this process."""
     robot = known_robots()["reacher"]
-    for mode in (*robot.modes.values(), *robot.rivals.values()):
+    tuned = [settings for rivals in robot.rivals.values() for settings in rivals.values()]
+    for mode in (*robot.modes.values(), *tuned):
         for name, value in REDUCED.items():
             monkeypatch.setitem(mode, name, value)
     monkeypatch.setitem(robot.modes["original"], "adapt_epochs", 1)

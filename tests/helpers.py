@@ -147,8 +147,12 @@ def models(draw: st.DrawFn) -> Dynamics:
         interaction_rank=draw(st.integers(0, 3)),
         members=members,
         degrees_of_freedom=draw(st.sampled_from([0.0, 3.0])),
+        activation=draw(st.sampled_from(["silu", "relu"])),
+        output_limit=draw(st.sampled_from([0.0, 10.0])),
+        normalise_actions=draw(st.booleans()),
     )
-    model.fit_normalisation(3 + 2 * torch.randn(50, obs_dim), 3 + 2 * torch.randn(50, obs_dim))
+    obs, action, next_obs = (torch.randn(50, dim) for dim in (obs_dim, model.action_dim, obs_dim))
+    model.fit_normalisation(3 + 2 * obs, 0.5 * action, 3 + 2 * next_obs)
     model.noise_std.copy_(torch.rand(members, obs_dim) + 0.5)
     return model
 

@@ -210,7 +210,7 @@ def make_belief(value: float, adaptations: int, members: int = 1) -> Belief:
     rows = 3 * members
     theta = {"weight_0": torch.full((rows, 2, 2), value), "bias_0": torch.full((rows, 2), value)}
     h, log_posterior, candidate = torch.full((rows, 4), value), torch.full((3, 5), value), torch.full((3,), int(value))
-    return Belief(theta, h, log_posterior, candidate, adaptations)
+    return Belief(theta, h, log_posterior, candidate, torch.zeros_like(candidate), adaptations)
 
 
 @given(st.lists(st.booleans(), min_size=3, max_size=3), st.integers(1, 3))

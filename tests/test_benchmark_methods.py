@@ -133,7 +133,8 @@ def test_cached_model_outlasts_all_settings_but_those_of_its_learning(
     METHODS[method].agent(task_of(0, tmp_path))
     watched.clear()
     robot = known_robots()["reacher"]
-    for settings in (*robot.modes.values(), *robot.rivals.values()):
+    tuned = [settings for rivals in robot.rivals.values() for settings in rivals.values()]
+    for settings in (*robot.modes.values(), *tuned):
         for name, value in changed.items():
             monkeypatch.setitem(settings, name, value)
     agent: Any = METHODS[method].agent(task_of(0, tmp_path))

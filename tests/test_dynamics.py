@@ -49,7 +49,7 @@ def test_folded_network_equals_prediction_with_the_same_embedding(
         members=members,
     ).double()
     obs, action, next_obs = (values.double() for values in random_transitions(model, 2 * members, 5))
-    model.fit_normalisation(3 + 2 * obs, 1 + 3 * next_obs)
+    model.fit_normalisation(3 + 2 * obs, 0.5 + 0.1 * action, 1 + 3 * next_obs)
     data = model.encode(obs, action, next_obs)
     theta, h = {name: value.double() for name, value in random_theta(model, 2).items()}, random_h(model, 2).double()
     folded = model.forward(model.network(theta, h), data.x)
@@ -317,7 +317,7 @@ def test_normalised_data_have_mean_zero_and_deviation_one() -> None:
     model = simple_model()
     obs, action, next_obs = random_transitions(model, 4, 500)
     obs, next_obs = obs * torch.tensor([1.0, 10.0, 0.01]) + 7, next_obs * torch.tensor([1.0, 10.0, 0.01]) + 7
-    model.fit_normalisation(obs, next_obs)
+    model.fit_normalisation(obs, action, next_obs)
     data = model.encode(obs, action, next_obs)
     for values in (data.x[..., :3], data.y):
         torch.testing.assert_close(values.mean(dim=(0, 1)), torch.zeros(3), atol=1e-3, rtol=0)
@@ -331,7 +331,7 @@ def test_dimension_that_never_varies_is_not_blown_up(constant: float) -> None:
     model = simple_model()
     obs, action, next_obs = random_transitions(model, 4, 50)
     obs[..., 1] = next_obs[..., 1] = constant
-    model.fit_normalisation(obs, next_obs)
+    model.fit_normalisation(obs, action, next_obs)
     data = model.encode(obs + torch.tensor([0.0, 1.0, 0.0]), action, next_obs)
     assert data.x[..., 1].abs().max() < 2
     assert data.y[..., 1].abs().max() < 2

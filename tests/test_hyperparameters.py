@@ -45,8 +45,9 @@ def test_file_names_no_setting_that_is_gone(robot: str, mode: str) -> None:
     entry, known = known_robots()[robot], set(Hyperparameters().to_dict())
     assert set(entry.modes) - {"original"} == set(MODES)
     assert set(entry.modes[mode]) <= known
-    for rival in entry.rivals:
-        assert set(entry.rivals[rival]) <= known
+    assert set(entry.rivals) <= set(entry.modes)
+    for rivals in entry.rivals.values():
+        assert all(set(settings) <= known for settings in rivals.values())
         assert entry.hyperparameters("paper", rival) == entry.hyperparameters("paper")
 
 

@@ -179,7 +179,7 @@ def test_model_that_sees_the_actions_alone_is_normalised_without_a_warning() -> 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            model.fit_normalisation(torch.randn(10, 4), torch.randn(10, 4))
+            model.fit_normalisation(torch.randn(10, 4), torch.randn(10, model.action_dim), torch.randn(10, 4))
     finally:
         torch.set_warn_always(warned_always)
 

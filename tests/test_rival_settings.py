@@ -39,16 +39,21 @@ def test_rivals_have_no_embeddings_in_any_mode(make_env: Callable[..., Any], riv
 
 
 @pytest.mark.parametrize("robot", [name for name, robot in known_robots().items() if robot.rivals])
-def test_rivals_have_settings_of_their_own_in_one_mode(make_env: Callable[..., Any], robot: str) -> None:
+def test_rivals_have_settings_of_their_own(make_env: Callable[..., Any], robot: str) -> None:
     entry = known_robots()[robot]
     env = make_env(entry.env_id or "Pendulum-v1")
     assert FAMLE(env, device="cpu", pretrained=False).hyperparameters == entry.hyperparameters("ours")
-    assert set(entry.rivals) == set(RIVALS)
+    assert {mode: set(rivals) for mode, rivals in entry.rivals.items()} == {
+        "ours": set(RIVALS),
+        "paper": {"first-order-maml", "maml"},
+    }
     for rival, (cls, own) in RIVALS.items():
-        tuned = entry.rivals[rival]
+        for mode in ("ours", "paper"):
+            tuned = entry.rivals[mode].get(rival, {})
+            settings = settings_of(rival, env, mode)
+            assert settings == entry.hyperparameters(mode, **{**tuned, **cls._implied, **own})
+        tuned = entry.rivals["ours"][rival]
         assert tuned
-        assert {name: getattr(settings_of(rival, env), name) for name in tuned} == tuned
-        assert settings_of(rival, env, "paper") == entry.hyperparameters("paper", **{**cls._implied, **own})
         defaults = {name: getattr(Hyperparameters(), name) for name in tuned}
         assert {name: getattr(settings_of(rival, env, **defaults), name) for name in tuned} == defaults
 
