@@ -26,7 +26,7 @@ from benchmarks import curves
 from benchmarks.ant_oracle import ant_oracle
 from benchmarks.compare import compare
 from benchmarks.harness import Options, Result
-from benchmarks.methods import METHODS, PPO_METHODS, Method, famle, from_cache, settings_of
+from benchmarks.methods import METHODS, PPO_METHODS, Method, about, famle, from_cache
 from benchmarks.reporting.report import show
 from benchmarks.task import Task
 from famle_agent import FAMLE, FAMLEWrapper, ModelBasedAgent
@@ -166,14 +166,14 @@ def run(method: str, task: Task, args: Args) -> Result:
         env.get_wrapper_attr("set_situation")(task.situation)
     result = run_and_break(env, task.situation, args.steps, break_at, task.seed)
     env.close()
-    return _result(result, task.situation) | {"settings": settings_of(agent)}
+    return _result(result, task.situation) | about(agent)
 
 
 def run_fleet(method: str, tasks: Sequence[Task], args: Args) -> list[Result]:
     """Many episodes of one replicate, or of many in step."""
     steps = args.ppo_steps if method in PPO_METHODS else args.curve_steps
     life = args.life("ant-curves", method, [task.seed for task in tasks])
-    return curves.run(ANT_METHODS[method].on(tasks), tasks, steps, life)
+    return curves.run(ANT_METHODS[method].on(tasks), tasks, steps, life, minutes=args.minutes)
 
 
 def _result(result: BrokenRun, situation: Situation) -> Result:
@@ -199,7 +199,10 @@ def main(args: Args) -> None:
     """Runs and reports."""
     methods = args.methods or DEFAULT_METHODS[args.experiment]
     folder = args.out / f"ant-{args.experiment}"
-    tasks = [Task("ant", seed, damage_of(args.experiment, seed), args.cache) for seed in range(args.replicates)]
+    tasks = [
+        Task("ant", seed, damage_of(args.experiment, seed), args.cache, device=args.device)
+        for seed in range(args.replicates)
+    ]
     fleets = partial(run_fleet, args=args) if args.experiment == "curves" else None
     compare(methods, tasks, partial(run, args=args), folder, args, ANT_METHODS, fleets)
     show(args.out, folder.name)

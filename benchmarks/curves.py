@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -17,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from benchmarks.harness import Result
 from benchmarks.lives import History, Repeatable, read_life, write_life
-from benchmarks.methods import settings_of
+from benchmarks.methods import about
 from benchmarks.task import Task
 from famle_agent import ModelBasedAgent
 
@@ -25,7 +26,12 @@ __all__ = ["run"]
 
 
 def run(
-    agent: BaseAlgorithm, tasks: Sequence[Task], steps: int, saved: Path | None = None, save_every: float = 60.0
+    agent: BaseAlgorithm,
+    tasks: Sequence[Task],
+    steps: int,
+    saved: Path | None = None,
+    save_every: float = 60.0,
+    minutes: float = math.inf,
 ) -> list[Result]:
     """One replicate, or many in step: an agent learns, adapts or plans, each in its way, on broken robots.
 
@@ -36,6 +42,7 @@ def run(
         saved: The file of an agent's life, which goes on from there and is saved there.
         save_every: Seconds between two savings at least. It waits for the end of an episode, or where an agent learns
             from rollouts for the beginning of one: the episode that is going on then is not counted.
+        minutes: Wall time after which a model-based agent ends with the episode; only whole episodes are counted.
 
     Raises:
         ValueError: The steps do not suffice for one episode.
@@ -52,22 +59,27 @@ def run(
         history = earlier
         for robot, state in zip(robots, history.random, strict=True):
             robot.begin_with(state)
-    historian = _Historian(history, envs, saved, save_every)
+    historian = _Historian(history, envs, saved, save_every, minutes)
     if (missing := steps - history.steps) > 0:
         agent.learn(missing * len(envs), callback=historian)
     vec_env.close()
-    settings = {"settings": settings_of(agent)}
-    return [_result(task, historian.history, i, steps) | settings for i, task in enumerate(tasks)]
+    return [_result(task, historian.history, i, steps) | about(agent, i) for i, task in enumerate(tasks)]
 
 
 class _Historian(BaseCallback):
     """Notes what robots go through, and saves it now and then."""
 
     def __init__(
-        self, earlier: History, envs: Sequence[Monitor[Any, Any]], saved: Path | None, save_every: float
+        self,
+        earlier: History,
+        envs: Sequence[Monitor[Any, Any]],
+        saved: Path | None,
+        save_every: float,
+        minutes: float,
     ) -> None:
         super().__init__()
         self._earlier, self._envs, self._saved, self._save_every = earlier, envs, saved, save_every
+        self._minutes = minutes
         self._start = self._saved_at = time.perf_counter()
 
     @property
@@ -84,6 +96,7 @@ class _Historian(BaseCallback):
     def _on_step(self) -> bool:
         if isinstance(self.model, ModelBasedAgent) and self.locals["dones"].all():
             self._save()
+            return time.perf_counter() - self._start < 60.0 * self._minutes
         return True
 
     def _on_rollout_start(self) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from benchmarks.harness import Result
-from benchmarks.methods import METHODS, Method, settings_of
+from benchmarks.methods import METHODS, Method, about
 from benchmarks.task import Task
 from famle_agent import FAMLEWrapper, ModelBasedAgent
 from famle_agent.journey import run_journey
@@ -31,7 +31,7 @@ def run(method: str, task: Task, known: Mapping[str, Method] = METHODS) -> Resul
         "situation": str(task.situation),
         "later": None if task.later is None else str(task.later),
         "profile": profile,
-        "settings": settings_of(agent),
+        **about(agent),
         "gaits": journey.gaits,
         "reached": journey.reached,
         "fell": journey.fell,

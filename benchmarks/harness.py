@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 import subprocess
 import sys
@@ -63,6 +64,10 @@ class Options:
     """Folder of long replicates on their way, which go on from there."""
     in_step: int = 30
     """Replicates of one method that act in step at most, where its robots can do that."""
+    device: str = "cpu"
+    """Where agents compute; their networks are learnt on the CPU."""
+    minutes: float = math.inf
+    """Wall time after which learning curves end with their episode; the report's title says how long they are."""
 
     def life(self, experiment: str, method: str, seeds: Sequence[int]) -> Path:
         """The file of the life of robots in step."""

@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from benchmarks import ppo
@@ -32,9 +31,9 @@ __all__ = [
     "PPO_METHODS",
     "MetaTrained",
     "Method",
+    "about",
     "famle",
     "from_cache",
-    "settings_of",
     "shipped",
     "simulated_data",
 ]
@@ -70,15 +69,19 @@ class Method:
         return self.fleet(tasks)
 
 
-def settings_of(agent: BaseAlgorithm) -> str:
-    """A short name of all of an agent's settings; empty for an agent that is not ours.
+def about(agent: BaseAlgorithm, robot: int = 0) -> dict[str, Any]:
+    """What a result keeps of its agent: a short name of all settings, its device, and how its adaptations went.
 
-    Results keep it, so that a method whose settings were changed between its replicates can be told.
+    Args:
+        agent: One of ours, or of Stable-Baselines3, of which only the device is known.
+        robot: Which of the robots that act in step.
     """
-    if not isinstance(agent, ModelBasedAgent):
-        return ""
-    settings = json.dumps(agent.hyperparameters.to_dict(), sort_keys=True)
-    return f"{zlib.crc32(settings.encode()):08x}"
+    known: dict[str, Any] = {"settings": "", "device": agent.device.type}
+    if isinstance(agent, ModelBasedAgent):
+        settings, belief = json.dumps(agent.hyperparameters.to_dict(), sort_keys=True), agent.belief
+        known["settings"] = f"{zlib.crc32(settings.encode()):08x}"
+        known |= {"adaptations": belief.adaptations, "diverged": int(belief.diverged[robot])}
+    return known
 
 
 # --- FAMLE ------------------------------------------------------------------------------------------------------------
@@ -101,7 +104,7 @@ def famle(task: Task, **overrides: Any) -> FAMLE:
     """FAMLE with the model that the package ships, or where it ships none a model of the replicate's own."""
     if _is_shipped(task.robot):
         return shipped(task.robot, task.seed, **overrides)
-    agent = FAMLE(task.robot, seed=task.seed, device="cpu", **overrides)
+    agent = FAMLE(task.robot, seed=task.seed, device=task.device, **overrides)
     return from_cache(agent, task.cache / f"{task.robot}-ours-{task.seed}.zip")
 
 
@@ -164,48 +167,33 @@ class MetaTrained:
         cls: The kind of agent.
         mode: Of its settings.
         networks: Replicate i has network i, counted round.
-        in_step: Whether many replicates can act in step.
         settings: Settings to change.
+        simulation: Settings to change while the networks are learnt, and not on the robot.
     """
 
     name: str
     cls: type[ModelBasedAgent]
     mode: str = "ours"
     networks: int = 10
-    in_step: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)
+    simulation: Mapping[str, Any] = field(default_factory=dict)
 
     def method(self) -> Method:
         """How this agent comes to be."""
-        return Method(self.agent, self.learn, self.fleet if self.in_step else None)
+        return Method(self.agent, self.learn, self.fleet)
 
     def agent(self, task: Task) -> ModelBasedAgent:
         """The agent of a replicate."""
-        many = self.learn(task)
-        if _is_shipped(task.robot):
-            return many
-        one = self._new(task.robot, task.seed)
-        one.situations = many.situations
-        one.dynamics = many._require_dynamics().with_members(1, first=task.seed % self.networks)
-        return one
+        return self.fleet([task])
 
     def fleet(self, tasks: Sequence[Task]) -> ModelBasedAgent:
-        """One agent whose robots have the networks of their replicates.
-
-        Raises:
-            ValueError: Robots would go back to a network that is not theirs.
-        """
-        agent = self.agent(tasks[0])
-        if _is_shipped(tasks[0].robot):
-            return agent
-        if not agent.hyperparameters.keep_adapting:
-            raise ValueError(f"The robots of {self.name} do not keep their networks; run them one by one.")
-        many = self.learn(tasks[0])._require_dynamics()
-        rows = torch.tensor([task.seed % self.networks for task in tasks])
-        state = agent._state_of(len(tasks))
-        theta = {name: value[rows] for name, value in many.parameters_by_name().items()}
-        belief = replace(state.belief, theta=theta, h=many.embeddings.detach()[rows, 0])
-        agent._live = replace(state, belief=belief)
+        """One agent whose robots have the networks of their replicates."""
+        task, many = tasks[0], self.learn(tasks[0])
+        agent = self._new(task)
+        agent.situations, agent.dynamics = many.situations, many._require_dynamics()
+        if not _is_shipped(task.robot):
+            agent.dynamics = agent.dynamics.for_robots([task.seed % self.networks for task in tasks])
+        agent.dynamics.to(agent.device)
         return agent
 
     def learn(self, task: Task) -> ModelBasedAgent:
@@ -214,7 +202,7 @@ class MetaTrained:
         Learning that is stopped goes on from a folder beside the cached file, if it is asked for again.
         """
         members = {} if _is_shipped(task.robot) else {"members": self.networks}
-        agent = self._new(task.robot, seed=0, **members)
+        agent = self._new(replace(task, seed=0, device="cpu"), **self.simulation, **members)
         path = task.cache / f"{task.robot}-{self.name}.zip"
         on_its_way = path.with_suffix("")
         agent = from_cache(agent, path, partial(self._learn, task=task, folder=on_its_way))
@@ -225,8 +213,9 @@ class MetaTrained:
         data = simulated_data(task) if self.mode == "ours" else None
         agent.meta_learn(data, progress_bar=True, n_jobs=-1, folder=folder)
 
-    def _new(self, robot: str, seed: int, **more: Any) -> ModelBasedAgent:
-        return self.cls(robot, self.mode, seed=seed, device="cpu", pretrained=False, **{**self.settings, **more})
+    def _new(self, task: Task, **more: Any) -> ModelBasedAgent:
+        settings = {**self.settings, **more}
+        return self.cls(task.robot, self.mode, seed=task.seed, device=task.device, pretrained=False, **settings)
 
 
 def simulated_data(task: Task) -> Transitions:
@@ -248,18 +237,39 @@ def simulated_data(task: Task) -> Transitions:
     return Transitions.load(path)
 
 
+ORIGINAL_CANDIDATES = 64
+"""Sequences that the planned episodes of the authors' data are planned with, of their 10,000: what can be afforded."""
+
+
 # --- what they are called ---------------------------------------------------------------------------------------------
 
 
+MAML: Mapping[str, Mapping[str, str]] = {
+    "reptile": {"meta_learner": "reptile"},
+    "fomaml": {"meta_learner": "first-order-maml"},
+    "maml": {"meta_learner": "maml"},
+}
+"""The ways to meta-learn without embeddings, by the short name of the rival."""
+
+HELD: Mapping[str, Mapping[str, Any]] = {"paper": {}, "paper-held": {"action_hold": 5}}
+"""The paper's settings, and what is changed of them where random actions are held."""
+
+PAPER_NETWORKS = 30
+"""Replicates of the paper's settings, each with a network of its own."""
+
 META_TRAINED: dict[str, MetaTrained] = {
-    "famle-paper": MetaTrained("paper", FAMLE, "paper"),
-    "famle-paper-held": MetaTrained("paper-held", FAMLE, "paper", settings={"action_hold": 5}),
-    "famle-original": MetaTrained("original", FAMLE, "original"),
-    "ampc": MetaTrained("ampc", AMPC, networks=30, in_step=True),
-    "ampc-reptile": MetaTrained("reptile", AMPCMAML, in_step=True, settings={"meta_learner": "reptile"}),
-    "ampc-reptile-paper": MetaTrained("paper-reptile", AMPCMAML, "paper", settings={"meta_learner": "reptile"}),
-    "ampc-fomaml": MetaTrained("fomaml", AMPCMAML, in_step=True, settings={"meta_learner": "first-order-maml"}),
-    "ampc-maml": MetaTrained("maml", AMPCMAML, in_step=True, settings={"meta_learner": "maml"}),
+    **{f"famle-{name}": MetaTrained(name, FAMLE, "paper", PAPER_NETWORKS, held) for name, held in HELD.items()},
+    "famle-original": MetaTrained(
+        "original", FAMLE, "original", PAPER_NETWORKS, simulation={"candidates": ORIGINAL_CANDIDATES}
+    ),
+    "ampc": MetaTrained("ampc", AMPC, networks=30),
+    "ampc-paper": MetaTrained("paper-ampc", AMPC, "paper", PAPER_NETWORKS),
+    **{f"ampc-{rival}": MetaTrained(rival, AMPCMAML, settings=settings) for rival, settings in MAML.items()},
+    **{
+        f"ampc-{rival}-{name}": MetaTrained(f"{name}-{rival}", AMPCMAML, "paper", PAPER_NETWORKS, {**settings, **held})
+        for rival, settings in MAML.items()
+        for name, held in HELD.items()
+    },
 }
 """Those whose meta-training the package does not ship, by name."""
 

@@ -24,8 +24,10 @@ from famle_envs import Situation
 from famle_envs.reacher import ReacherEnv
 
 MODEL_BASED = (
-    *("famle", "famle-paper", "famle-paper-held", "famle-original"),
-    *("ampc", "ampc-reptile", "ampc-reptile-paper", "ampc-fomaml", "ampc-maml"),
+    *("famle", "ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml"),
+    *("famle-paper", "ampc-paper", "ampc-reptile-paper", "ampc-fomaml-paper", "ampc-maml-paper"),
+    *("famle-paper-held", "ampc-reptile-paper-held", "ampc-fomaml-paper-held", "ampc-maml-paper-held"),
+    "famle-original",
 )
 
 
@@ -54,7 +56,7 @@ def run_fleet(method: str, tasks: Sequence[Task], args: Args) -> list[Result]:
     """One replicate, or many in step."""
     steps = args.ppo_steps if method in PPO_METHODS else args.steps
     life = args.life(f"reacher-{args.damage}", method, [task.seed for task in tasks])
-    return curves.run(METHODS[method].on(tasks), tasks, steps, life)
+    return curves.run(METHODS[method].on(tasks), tasks, steps, life, minutes=args.minutes)
 
 
 def run(method: str, task: Task, args: Args) -> Result:
@@ -65,7 +67,10 @@ def run(method: str, task: Task, args: Args) -> Result:
 def main(args: Args) -> None:
     """Runs and reports."""
     methods = args.methods or (*MODEL_BASED, *PPO_METHODS, "famle-frozen", "oracle")
-    tasks = [Task("reacher", seed, situation_of(args.damage, seed), args.cache) for seed in range(args.replicates)]
+    tasks = [
+        Task("reacher", seed, situation_of(args.damage, seed), args.cache, device=args.device)
+        for seed in range(args.replicates)
+    ]
     folder = args.out / f"reacher-{args.damage}"
     compare(methods, tasks, partial(run, args=args), folder, args, run_fleet=partial(run_fleet, args=args))
     show(args.out, folder.name)

@@ -28,6 +28,7 @@ class Task:
         profile: What else differs from the simulator.
         later: What goes wrong on the way, if anything does.
         strikes_at: The action before which it does.
+        device: Where the agent computes.
     """
 
     robot: str
@@ -37,6 +38,7 @@ class Task:
     profile: str | Profile = ""
     later: Situation | None = None
     strikes_at: int = 0
+    device: str = "cpu"
 
     @property
     def env_id(self) -> str:

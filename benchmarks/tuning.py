@@ -103,7 +103,7 @@ def method_with(name: str, setting: str, value: str) -> Method:
 
 def _live(method: str, tasks: Sequence[Task], args: Args, known: Mapping[str, Method]) -> list[Result]:
     life = args.life(f"tuning-{args.robot}", method, [task.seed for task in tasks])
-    return curves.run(known[method].on(tasks), tasks, args.steps, life)
+    return curves.run(known[method].on(tasks), tasks, args.steps, life, minutes=args.minutes)
 
 
 def _live_alone(method: str, task: Task, args: Args, known: Mapping[str, Method]) -> Result:

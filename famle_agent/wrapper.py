@@ -21,7 +21,8 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
 
     Each step's ``info["famle"]`` says what the agent believes: ``situation``, the most likely training situation;
     ``probability``, how likely it is among them; ``posterior``, all of them by name; ``adaptations``, how often the
-    agent has adapted, and ``diverged``, how often its gradient steps left the finite numbers and were taken back. The memory outlasts a reset, as damage does; ``agent.forget()`` empties it.
+    agent has adapted; ``diverged``, how often its gradient steps left the finite numbers and were taken back. The
+    memory outlasts a reset, as damage does; ``agent.forget()`` empties it.
 
     Args:
         env: The robot's environment.

@@ -150,7 +150,7 @@ class AntEnv(BulletEnv):
         return self.reward_fn(obs, action, next_obs) - 4.0 * (0.8 - upright).clip(min=0.0)
 
     def survival_reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
-        """The reward, less 2 m/s where the torso is below 0.26 m: what the planner of the authors' public code maximises.
+        """The reward, less 2 m/s where the torso is below 0.26 m; the planner of the authors' public code maximises it.
 
         Args:
             obs: Observations, (..., 27). Not used.

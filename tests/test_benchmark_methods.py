@@ -11,7 +11,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from benchmarks import curves, methods, reacher
-from benchmarks.methods import METHODS, PPO_METHODS, MetaTrained, settings_of
+from benchmarks.methods import META_TRAINED, METHODS, PPO_METHODS, MetaTrained, about
 from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent, simulation
 from famle_agent.progress import Progress
 from famle_agent.robots import known_robots
@@ -24,7 +24,7 @@ KINDS: dict[str, type[BaseAlgorithm]] = {
     **{name: AMPCMAML for name in METHODS if name.startswith("ampc-")},
     **{"ampc": AMPC, "ppo": PPO, "ppo-pretrained": PPO, "oracle": FAMLE, "one-simulator": FAMLE},
 }
-IN_STEP = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
+IN_STEP = tuple(META_TRAINED)
 
 
 def network_of(agent: Any) -> torch.Tensor:
@@ -102,7 +102,7 @@ def test_methods_differ_by_their_settings(method: str, expected: dict[str, Any],
 
 def test_results_tell_settings_apart(cache: Path) -> None:
     one, same, other, rival, model_free = (
-        settings_of(METHODS[method].agent(task_of(seed, cache)))
+        about(METHODS[method].agent(task_of(seed, cache)))["settings"]
         for method, seed in (("famle", 0), ("famle", 1), ("famle-frozen", 0), ("ampc", 0), ("ppo", 0))
     )
     assert one == same

@@ -48,7 +48,6 @@ def test_file_names_no_setting_that_is_gone(robot: str, mode: str) -> None:
     assert set(entry.rivals) <= set(entry.modes)
     for rivals in entry.rivals.values():
         assert all(set(settings) <= known for settings in rivals.values())
-        assert entry.hyperparameters("paper", rival) == entry.hyperparameters("paper")
 
 
 @every_robot
