@@ -237,7 +237,7 @@ class ModelBasedAgent(SimulationLearner):
     @property
     def belief(self) -> Belief:
         """What the agent believes of its robots now; of one robot where it has seen none."""
-        return (self._live or self._state_of(1)).belief
+        return (self._live or self._state_of(self._require_dynamics().robots)).belief
 
     @abstractmethod
     def posterior(self, state: OnlineState | None = None) -> dict[str, float]:

@@ -254,6 +254,26 @@ def test_preset_of_the_yaw_sensor_is_off_by_that_angle(make: Make, degrees: int)
     assert missed.magnitude() == pytest.approx(0.0, abs=1e-6)
 
 
+@given(st.floats(-10, 10), st.integers(0, 10))
+def test_stuck_yaw_sensor_gives_its_error_instead_of_the_yaw(error: float, seed: int) -> None:
+    with closing(AntEnv()) as true, closing(AntEnv(yaw_sensor="stuck")) as stuck:
+        true.reset(seed=seed)
+        stuck.reset(seed=seed, options={"situation": {"orientation_error": error}})
+        actions = commands(30, seed)
+        real, seen = follow(true, actions), follow(stuck, actions)
+    one, other = (Rotation.from_quat(row[:, QUATERNION]).as_euler("ZYX") for row in (real, seen))
+    np.testing.assert_allclose(np.cos(other[:, 0] - error), 1.0, atol=1e-5)
+    np.testing.assert_allclose(other[:, 1:], one[:, 1:], atol=1e-5)
+    np.testing.assert_array_equal(np.delete(seen, range(1, 5), 1), np.delete(real, range(1, 5), 1))
+    assert (seen[:, 4] >= 0.0).all()
+
+
+@pytest.mark.parametrize("name", ["added", "", None])
+def test_unknown_yaw_sensor_is_refused(name: Any) -> None:
+    with pytest.raises(ValueError, match='yaw_sensor must be "offset" or "stuck", got'):
+        AntEnv(yaw_sensor=name)
+
+
 # --- The floor ---
 
 
@@ -338,3 +358,12 @@ def test_planner_is_warned_of_tipping_over_and_the_reward_is_not(kind: str) -> N
     with closing(AntEnv()) as robot:
         np.testing.assert_allclose(robot.reward_fn(batch, None, batch), 2.0)
         np.testing.assert_allclose(robot.planning_reward_fn(batch, None, batch), [2.0, 2.0, -1.2, -5.2], atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["numpy", "torch"])
+def test_planner_of_the_authors_code_pays_for_a_low_torso(kind: str) -> None:
+    obs = np.zeros((3, 27), dtype=np.float32)
+    obs[:, 0], obs[:, 13] = (0.25, 0.27, 0.5), 1.5
+    batch = torch.from_numpy(obs) if kind == "torch" else obs
+    with closing(AntEnv()) as robot:
+        np.testing.assert_allclose(robot.survival_reward_fn(batch, None, batch), [-0.5, 1.5, 1.5])

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("small_reacher")
 KINDS: dict[str, type[BaseAlgorithm]] = {
     **{name: FAMLE for name in METHODS if name.startswith("famle")},
     **{name: AMPCMAML for name in METHODS if name.startswith("ampc-")},
-    **{"ampc": AMPC, "ppo": PPO, "ppo-pretrained": PPO, "oracle": FAMLE, "one-simulator": FAMLE},
+    **{"ampc": AMPC, "ampc-paper": AMPC, "ppo": PPO, "ppo-pretrained": PPO, "oracle": FAMLE, "one-simulator": FAMLE},
 }
 IN_STEP = tuple(META_TRAINED)
 
@@ -172,7 +172,7 @@ def test_replicates_take_turns_with_the_networks_of_one_ensemble(
         agent.get_env().close()
 
 
-@pytest.mark.parametrize("method", [*IN_STEP, "famle-paper", "famle-original"])
+@pytest.mark.parametrize("method", IN_STEP)
 def test_replicates_of_a_method_have_networks_of_their_own(method: str, cache: Path) -> None:
     agents = [METHODS[method].agent(task_of(seed, cache)) for seed in range(10)]
     assert len({tuple(network_of(agent)[0].tolist()) for agent in agents}) == 10
@@ -231,15 +231,26 @@ def test_robots_in_step_have_the_networks_of_their_replicates(method: str, cache
     fleet.set_env(DummyVecEnv([task.make for task in tasks]))
     fleet.learn(2)
     assert torch.equal(network_of(fleet), expected)  # one step a robot: too early to adapt
-    fleet.learn(4)
+    fleet.learn(2 * max(1, fleet.hyperparameters.adapt_every - 1))
     assert fleet.belief.adaptations == 1
     moved = (network_of(fleet) - expected).abs().amax(dim=1)
     assert (moved > 0).all()
-    assert moved.max() < 0.1  # each goes on from its own
+    assert moved.max() < 0.5  # each is near its own
     fleet.get_env().close()
 
 
-def test_robots_that_would_go_back_to_another_network_are_refused(tmp_path: Path) -> None:
-    recipe = MetaTrained("restarts", AMPCMAML, settings={"keep_adapting": False})
-    with pytest.raises(ValueError, match="run them one by one"):
-        recipe.fleet([task_of(0, tmp_path)])
+def test_results_say_how_adaptations_went(cache: Path) -> None:
+    tasks = [task_of(seed, cache) for seed in (0, 1)]
+    fleet = METHODS["ampc-reptile-paper"].on(tasks)
+    assert isinstance(fleet, ModelBasedAgent)
+    results = curves.run(fleet, tasks, 4 * EPISODE)
+    assert [(result["adaptations"], result["diverged"]) for result in results] == [(4, 0)] * 2
+    assert all(result["device"] == "cpu" for result in results)
+    (model_free,) = curves.run(METHODS["ppo"].agent(tasks[0]), tasks[:1], EPISODE)
+    assert "diverged" not in model_free
+
+
+def test_network_may_be_learnt_with_another_planner_than_it_is_used_with(tmp_path: Path) -> None:
+    recipe = MetaTrained("planned", FAMLE, "paper", simulation={"candidates": 3})
+    assert recipe.learn(task_of(0, tmp_path)).hyperparameters.candidates == 3
+    assert recipe.agent(task_of(0, tmp_path)).hyperparameters.candidates == REDUCED["candidates"]

@@ -81,6 +81,14 @@ def test_actions_are_held_and_drawn_anew_when_an_episode_begins(hold: int, lengt
         assert np.array_equal(data.action[0, i], data.action[0, i - 1]) == (not redrawn)
 
 
+@given(st.integers(1, 9), st.integers(0, 9))
+def test_episode_ends_where_the_environment_or_its_length_ends_it(own: int, length: int) -> None:
+    data = collected(n=20, envs=[Clock(own)], episode_length=length)
+    shorter = min(own, length) if length else own
+    assert data.obs[0, :, 1].tolist() == [i % shorter for i in range(20)]
+    assert data.obs[0, :, 0].tolist() == [i // shorter for i in range(20)]
+
+
 def test_actions_fill_the_action_space() -> None:
     action = collected(n=500, envs=[Clock()]).action[0]
     assert (action >= LOW).all()

@@ -131,6 +131,12 @@ def test_life_is_saved_now_and_then(cache: Path, tmp_path: Path) -> None:
     assert not life.exists()  # not a minute has passed
 
 
+def test_curve_that_takes_too_long_ends_with_its_episode(cache: Path) -> None:
+    task = task_of(0, cache)
+    (result,) = curves.run(METHODS["famle"].agent(task), [task], 9 * EPISODE, minutes=0.0)
+    assert result["lengths"] == [EPISODE]
+
+
 def test_test_robot_is_broken_as_the_task_says(cache: Path) -> None:
     task = task_of(0, cache)
     env = task.make()

@@ -146,6 +146,22 @@ def test_model_goes_on_from_round_to_round(make_agent: Make, monkeypatch: pytest
     assert torch.equal(models[2].input_mean, fresh.dynamics.input_mean)  # the units stay those of the first round
 
 
+def test_last_round_may_begin_anew(make_agent: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = make_agent(restart_last_round=True, joint_lr=0.0, joint_embedding_lr=0.0, meta_iterations=0)
+    models, learn = list[Dynamics](), agent._learn_model
+
+    def learn_model(*args: Any) -> None:
+        learn(*args)
+        assert agent.dynamics is not None
+        models.append(agent.dynamics)
+
+    monkeypatch.setattr(agent, "_learn_model", learn_model)
+    agent.meta_learn(SITUATIONS)
+    assert models[0] is models[1] is not models[2]
+    assert not torch.equal(models[2].embeddings, models[0].embeddings)
+    assert not torch.equal(models[2].input_mean, models[0].input_mean)  # it is measured on all transitions
+
+
 def test_meta_learning_again_begins_anew(make_agent: Make) -> None:
     agent = make_agent(rounds=0).meta_learn(SITUATIONS)
     before = agent.dynamics
