@@ -8,7 +8,8 @@ python -m benchmarks.ant --experiment members         # ensembles of one to four
 python -m benchmarks.ant --experiment curves --replicates 10   # all methods over many episodes: the paper's figure 4
 
 Replicates share the shipped model; each has its own damage and its own seed of the robot and the planner. The agent
-without embeddings is trained from scratch by its method, and the oracle learns on from the shipped model.
+without embeddings is trained from scratch by its method, and the one that is told its damage learns on from the
+shipped model.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import numpy as np
 import tyro
 
 from benchmarks import curves
-from benchmarks.ant_oracle import ant_oracle
+from benchmarks.ant_informed import informed
 from benchmarks.compare import compare
 from benchmarks.harness import Options, Result
 from benchmarks.methods import METHODS, PPO_METHODS, Method, about, famle, from_cache
@@ -75,13 +76,13 @@ class Args(Options):
 
 RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
 DEFAULT_METHODS: dict[str, tuple[str, ...]] = {
-    "unseen": ("famle", "famle-48", "famle-frozen", "famle-nearest", "famle-theta", "without-embeddings", "oracle"),
+    "unseen": ("famle", "famle-48", "famle-frozen", "famle-nearest", "famle-theta", "without-embeddings", "informed"),
     "validation": ("famle", "famle-window", "famle-h", "famle-theta", "famle-validated"),
     "members": ("members-1", "members-2", "members-3", "famle"),
     "break": ("famle", "famle-window", "famle-frozen"),
     "untrained": ("famle", "famle-frozen"),
     "intact": ("famle",),
-    "curves": ("famle", "famle-frozen", *RIVALS, *PPO_METHODS, "oracle"),
+    "curves": ("famle", "famle-frozen", *RIVALS, *PPO_METHODS, "informed"),
 }
 
 
@@ -140,14 +141,14 @@ def in_step(tasks: Sequence[Task], **overrides: Any) -> FAMLE:
 
 
 ANT_METHODS = {
-    **METHODS,
+    **{name: method for name, method in METHODS.items() if name != "oracle"},
     **{
         name: Method(partial(famle, **overrides), fleet=partial(in_step, **overrides))
         for name, overrides in VARIANTS.items()
     },
     **{f"members-{n}": Method(partial(with_members, members=n)) for n in (1, 2, 3)},
     "without-embeddings": Method(without_embeddings, without_embeddings),
-    "oracle": Method(ant_oracle),
+    "informed": Method(informed),
 }
 """What every robot can be run with, and what was asked of the ant alone."""
 

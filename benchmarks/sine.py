@@ -199,12 +199,12 @@ def summary(errors: list[NDArray[np.float64]]) -> Result:
     """
     pooled = np.concatenate(errors)
     lower, median, upper = quartiles(pooled)
-    mean, low, high = interquartile_mean(pooled)
+    mean, interval = interquartile_mean(pooled)
     return {
         "median": float(median),
         "quartiles": [float(lower), float(upper)],
         "iqm": mean,
-        "iqm_interval": [low, high],
+        "iqm_interval": list(interval or ()),
         "iqm_per_replicate": [float(trim_mean(values, 0.25)) for values in errors],
     }
 

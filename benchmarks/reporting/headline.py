@@ -16,8 +16,8 @@ from benchmarks.reporting.tables import Row, figures
 __all__ = ["headline", "insert"]
 
 METHODS = (
-    *("famle", "famle-paper", "famle-original", "ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml"),
-    *("ppo", "ppo-pretrained", "oracle"),
+    *("famle", "ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml", "ppo", "ppo-pretrained", "informed", "oracle"),
+    *("famle-paper", "ampc-paper", "ampc-reptile-paper", "ampc-fomaml-paper", "ampc-maml-paper", "famle-original"),
 )
 """What the table has rows for, where it was measured."""
 
@@ -37,7 +37,8 @@ def _solved(row: Row, study: Study) -> str:
 
 def _gaits(row: Row, study: Study) -> str:
     mean = row["steps_mean"]
-    return f"{100 * row['success']:.0f} %" + ("" if mean is None else f", {mean:.1f} +- {row['steps_deviation']:.1f}")
+    deviation = "" if row["steps_deviation"] is None else f" +- {row['steps_deviation']:.1f}"
+    return f"{100 * row['success']:.0f} %" + ("" if mean is None else f", {mean:.1f}{deviation}")
 
 
 COLUMNS: Sequence[tuple[str, str, Callable[[Row, Study], str]]] = (

@@ -14,6 +14,8 @@ from benchmarks.reporting.tables import Row
 
 __all__ = ["document", "section"]
 
+_SIGNIFICANT = 0.05
+
 Column = tuple[str, Callable[[Row], str]]
 """The heading of a column, and what it says of a row."""
 
@@ -59,7 +61,8 @@ def section(study: Study, rows: Sequence[Row], pictures: Sequence[str]) -> str:
     experiment = study.experiment
     measured = [row for row in rows if row["replicates"]]
     parts = [f"## {study.title}", *(f"![{experiment.title}]({picture})" for picture in pictures)]
-    parts.append(_table([_METHOD, _N, *_COLUMNS[experiment.kind](study), *_paper(study)], rows))
+    columns = [*_COLUMNS[experiment.kind](study), *_diverged(rows), *_paper(study)]
+    parts.append(_table([_METHOD, _N, *columns], rows))
     parts.append(_NOTES[experiment.kind].format(study=study))
     parts.append(_table([_METHOD, _N, *_measures(study)], measured))
     if compared := [row for row in measured if f"{study.measures[0].key}_famle_better" in row]:
@@ -73,11 +76,13 @@ with quartiles in round brackets; IQM is the interquartile mean with its bootstr
 *Of the oracle* is the ratio of IQMs over the seeds that both have, turned over where fewer is better, so that 100 % is
 as good as the oracle; in brackets stands how many seeds that is, where a method has more. *P(FAMLE better)* is the
 probability that a replicate of FAMLE does better than one of the other method, a tie counted half, with its bootstrap
-95 % interval; that is Clopper and Pearson's where all comparisons go the same way, and all of [0, 1] where a method has
-one replicate. Where each seed has a damage of its own,
-FAMLE is compared with the other method on the same damage alone, and it is the fraction of damages on which it does
-better; in round brackets stands how many they are, where a method has more. Intervals take replicates for independent
-also where they share networks.""",
+95 % interval; that is Clopper and Pearson's where all comparisons go the same way. Fewer than five replicates have no
+interval and no p. Where each seed has a damage of its own, FAMLE is compared with the other method on the same damage alone, and
+it is the fraction of damages on which it does better; in round brackets stands how many they are, where a method has
+more. p is of Wilcoxon's signed-rank test there and of Mann and Whitney's elsewhere, adjusted for all comparisons of an
+experiment (Benjamini and Hochberg). Intervals and tests take replicates for independent also where they share networks:
+the ant, the quadruped and the Minitaur have one network of each method. Deviations are those of a sample (n - 1).
+An adaptation that *diverged* left the finite numbers and was taken back; older results did not count them.""",
     """Times of replicates are wall times on machines that did other work too, and none are given of replicates that ran
 in step as one batch; those *in one run*, where methods took turns (`python -m benchmarks.step_time`), can be compared.
 The paper's figures for the quadruped and the Minitaur are of other bodies; they stand beside ours and not against
@@ -174,6 +179,11 @@ _COLUMNS: Mapping[Kind, Callable[[Study], list[Column]]] = {
 """The first table of each kind, as the paper's."""
 
 
+def _diverged(rows: Sequence[Row]) -> list[Column]:
+    """Where anybody counted it."""
+    return [("adaptations that diverged", _share)] if any("diverged" in row for row in rows) else []
+
+
 def _paper(study: Study) -> list[Column]:
     return [("the paper", lambda row: row.get("paper", "-"))] if study.experiment.paper else []
 
@@ -223,6 +233,13 @@ def _deviation(row: Row, key: str) -> str:
     return "-" if mean is None or deviation is None else f"{mean:.1f} +- {deviation:.1f}"
 
 
+def _share(row: Row) -> str:
+    if "diverged" not in row:
+        return "-"
+    often = row["diverged_replicates"]
+    return f"{100 * row['diverged']:.1f} %" + (f", over 10 % in {often} of {row['replicates']}" if often else "")
+
+
 def _together(row: Row) -> str:
     return f"{row['step_ms']:.1f} (x {row['times_robot_alone']:.1f})" if "step_ms" in row else "-"
 
@@ -236,6 +253,8 @@ def _spread(row: Row, key: str) -> str:
 def _interval(row: Row, key: str) -> str:
     if f"{key}_iqm" not in row:
         return "-"
+    if f"{key}_iqm_low" not in row:
+        return _decimals(row, key, "iqm")
     return "{} [{}, {}]".format(*(_decimals(row, key, name) for name in ("iqm", "iqm_low", "iqm_high")))
 
 
@@ -247,8 +266,10 @@ def _of_oracle(row: Row, key: str) -> str:
 def _better(row: Row, key: str) -> str:
     if f"{key}_famle_better" not in row:
         return "-"
-    cell = "{:.2f} [{:.2f}, {:.2f}]".format(*(row[f"{key}_famle_better{suffix}"] for suffix in ("", "_low", "_high")))
-    seeds = row[f"{key}_famle_better_seeds"]
+    name = f"{key}_famle_better"
+    cell, seeds = f"{row[name]:.2f}", row[f"{name}_seeds"]
+    if f"{name}_low" in row:
+        cell += f" [{row[f'{name}_low']:.2f}, {row[f'{name}_high']:.2f}], p = {row[f'{name}_p']:.2g}"
     return cell + (f" ({seeds})" if seeds != row["replicates"] else "")
 
 
@@ -270,10 +291,13 @@ def _better_than_famle(study: Study, rows: Sequence[Row]) -> str:
     """Who wins against FAMLE in what, so that nobody has to search for it."""
     wins = []
     for measure in study.measures:
-        winners = [row["label"] for row in rows if row.get(f"{measure.key}_famle_better_high", 1.0) < 0.5]
+        name = f"{measure.key}_famle_better"
+        winners = [
+            row["label"] for row in rows if row.get(name, 1.0) < 0.5 and row.get(f"{name}_p", 1.0) < _SIGNIFICANT
+        ]
         if winners:
             wins.append(f"{' / '.join(winners)} ({measure.label})")
-    return f"Better than FAMLE, the whole interval below one half: {'; '.join(wins) or 'none'}."
+    return f"Better than FAMLE, p < {_SIGNIFICANT}: {'; '.join(wins) or 'none'}."
 
 
 def _sources(study: Study) -> str:

@@ -214,8 +214,9 @@ def _colour_labels(axes: Axes, methods: Sequence[str]) -> None:
 
 
 def _mean_and_error(scores: Array) -> tuple[float, Array]:
-    """The interquartile mean, and how far its interval reaches to both sides, (2, 1)."""
-    mean, low, high = interquartile_mean(scores)
+    """The interquartile mean, and how far its interval reaches to both sides, (2, 1); not at all where it has none."""
+    mean, interval = interquartile_mean(scores)
+    low, high = interval or (mean, mean)
     return mean, np.maximum(0.0, [[mean - low], [high - mean]])
 
 

@@ -14,6 +14,7 @@ __all__ = [
     "first_crossing",
     "interquartile_mean",
     "median_steps",
+    "p_value",
     "probability_of_improvement",
     "quartiles",
     "solved_at",
@@ -21,7 +22,12 @@ __all__ = [
 
 Array = npt.NDArray[np.float64]
 
+Interval = tuple[float, float] | None
+"""A 95 % interval; None where there are too few replicates for one."""
+
 _RESAMPLES = 2000
+_FEWEST = 5
+"""Replicates that an interval needs: of fewer, the bootstrap's is far too narrow."""
 
 
 def solved_at(returns: Sequence[float], lengths: Sequence[int], threshold: float) -> int | None:
@@ -49,12 +55,14 @@ def quartiles(values: Any) -> Array:
     return np.percentile(np.asarray(values, dtype=np.float64), [25, 50, 75], axis=0)
 
 
-def interquartile_mean(values: Sequence[float] | Array) -> tuple[float, float, float]:
-    """The mean of the middle half and its 95 % bootstrap interval."""
+def interquartile_mean(values: Sequence[float] | Array) -> tuple[float, Interval]:
+    """The mean of the middle half and its bootstrap interval, which fewer than five replicates do not have."""
     data = np.asarray(values, dtype=np.float64)
     mean = float(stats.trim_mean(data, 0.25))
-    if len(data) < 2 or np.ptp(data) == 0.0:
-        return mean, mean, mean
+    if len(data) < _FEWEST:
+        return mean, None
+    if np.ptp(data) == 0.0:
+        return mean, (mean, mean)
     interval = stats.bootstrap(
         (data,),
         lambda x, axis: stats.trim_mean(x, 0.25, axis=axis),
@@ -62,17 +70,29 @@ def interquartile_mean(values: Sequence[float] | Array) -> tuple[float, float, f
         method="percentile",
         rng=np.random.default_rng(0),
     ).confidence_interval
-    return mean, float(interval.low), float(interval.high)
+    return mean, (float(interval.low), float(interval.high))
+
+
+def p_value(x: Sequence[float] | Array, y: Sequence[float] | Array, paired: bool = False) -> float:
+    """Two-sided p of the hypothesis that neither group is better: Wilcoxon's where paired, else Mann and Whitney's.
+
+    Arguments as for :func:`probability_of_improvement`. One replicate, or none that differs, says nothing: 1.
+    """
+    one, other = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    if paired:
+        return float(stats.wilcoxon(one, other).pvalue) if (one != other).any() else 1.0
+    if np.ptp(np.concatenate([one, other])) == 0.0:
+        return 1.0
+    return float(stats.mannwhitneyu(one, other).pvalue)
 
 
 def probability_of_improvement(
     x: Sequence[float] | Array, y: Sequence[float] | Array, paired: bool = False
-) -> tuple[float, float, float]:
-    """P(X > Y), a tie counted half, and its 95 % bootstrap interval.
+) -> tuple[float, Interval]:
+    """P(X > Y), a tie counted half, and its bootstrap interval, which fewer than five replicates do not have.
 
-    One replicate says nothing of how replicates differ: the interval is then all of [0, 1]. Where all comparisons go
-    the same way, resampling finds no spread either; the interval is then Clopper and Pearson's, of as many trials as
-    the smaller group has replicates.
+    Where all comparisons go the same way, resampling finds no spread; the interval is then Clopper and Pearson's, of as
+    many trials as the smaller group has replicates.
 
     Args:
         x: A figure of each replicate of one group, (n,).
@@ -88,15 +108,15 @@ def probability_of_improvement(
         raise ValueError("Both groups need a replicate to be compared.")
     wins = _pairs_won if paired else _wins
     p = float(wins(*groups))
-    if (n := min(len(group) for group in groups)) < 2:
-        return p, 0.0, 1.0
+    if (n := min(len(group) for group in groups)) < _FEWEST:
+        return p, None
     if p in (0.0, 1.0):
         exact = stats.binomtest(round(p * n), n).proportion_ci(0.95)
-        return p, float(exact.low), float(exact.high)
+        return p, (float(exact.low), float(exact.high))
     interval = stats.bootstrap(
         groups, wins, paired=paired, n_resamples=_RESAMPLES, method="percentile", rng=np.random.default_rng(0)
     ).confidence_interval
-    return p, float(interval.low), float(interval.high)
+    return p, (float(interval.low), float(interval.high))
 
 
 def _pairs_won(x: Array, y: Array, axis: int = -1) -> Any:

@@ -15,7 +15,17 @@ from benchmarks.reporting.looks import in_order, look
 from benchmarks.reporting.registry import Experiment, Kind
 from benchmarks.reporting.statistics import Array, quartiles
 
-__all__ = ["LAST", "ROBOT_ALONE", "SUBJECT", "Measure", "StepTime", "Study", "quartiles_over_steps", "read_study"]
+__all__ = [
+    "LAST",
+    "ROBOT_ALONE",
+    "SUBJECT",
+    "Measure",
+    "StepTime",
+    "Study",
+    "diverged_often",
+    "quartiles_over_steps",
+    "read_study",
+]
 
 SUBJECT = "famle"
 """The method that all others are compared with."""
@@ -194,6 +204,9 @@ class Study:
             parts += [f"{steps:,} robot steps of {labels}" for steps, labels in short]
         if mixed := [look(method).label for method, runs in self.runs.items() if _settings_differ(runs)]:
             parts.append("settings that differ between replicates of " + " / ".join(mixed))
+        often = {method: sum(map(diverged_often, runs)) for method, runs in self.runs.items()}
+        for n, labels in _by_number({method: n for method, n in often.items() if n}):
+            parts.append(f"more than one in ten adaptations diverged in {n} replicates of {labels}")
         return f"{self.experiment.title}: {'; '.join(parts)}"
 
     @property
@@ -232,6 +245,11 @@ def _by_number(numbers: Mapping[str, int]) -> list[tuple[int, str]]:
 def _settings_differ(runs: Sequence[Result]) -> bool:
     """Whether replicates of a method are of agents with different settings, as far as results know of them."""
     return len({run["settings"] for run in runs if "settings" in run}) > 1
+
+
+def diverged_often(run: Result) -> bool:
+    """Whether more than one in ten of a replicate's adaptations diverged, as far as it was counted."""
+    return bool(10 * run.get("diverged", 0) > run.get("adaptations", 0))
 
 
 def quartiles_over_steps(traces: Sequence[tuple[Array, Array]], hold: bool = False) -> tuple[Array, Array]:

@@ -9,20 +9,23 @@ from dataclasses import fields
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from benchmarks.harness import Result
 from benchmarks.reporting.looks import look
 from benchmarks.reporting.registry import Kind
 from benchmarks.reporting.statistics import (
     Array,
+    Interval,
     first_crossing,
     interquartile_mean,
     median_steps,
+    p_value,
     probability_of_improvement,
     quartiles,
     solved_at,
 )
-from benchmarks.reporting.study import LAST, SUBJECT, Measure, Study
+from benchmarks.reporting.study import LAST, SUBJECT, Measure, Study, diverged_often
 
 __all__ = ["Row", "figures", "replicates", "to_csv"]
 
@@ -42,7 +45,8 @@ def figures(study: Study) -> list[Row]:
         row |= _times(study, method)
         for measure in measures:
             row |= _improvement(study, method, measure)
-        rows.append(row | _published(study, look(method).paper))
+        rows.append(row | _diverged(runs) | _published(study, look(method).paper))
+    _correct_for_many(rows)
     shown = {look(method).paper for method in study.runs}
     for published in study.experiment.paper:
         if published.method not in shown:
@@ -63,7 +67,7 @@ def replicates(study: Study) -> list[Row]:
                 for i, value in enumerate(run["returns"]):
                     rows.append(row | {"episode": i + 1, "robot_steps": int(ends[i]), "return": value})
             else:
-                keys = ("return", "gaits", "reached", "fell", "distance")
+                keys = ("return", "gaits", "reached", "fell", "distance", "adaptations", "diverged")
                 rows.append(row | {key: run[key] for key in keys if key in run})
     return rows
 
@@ -84,13 +88,37 @@ def _spread(study: Study, method: str, measure: Measure) -> Row:
     """Median, quartiles and interquartile mean of a figure, and how much of the oracle's it is."""
     scores = study.scores(method, measure)
     low, median, high = quartiles(scores)
-    mean, mean_low, mean_high = interquartile_mean(scores)
-    row = {"median": median, "low": low, "high": high, "iqm": mean, "iqm_low": mean_low, "iqm_high": mean_high}
+    mean, interval = interquartile_mean(scores)
+    row = {"median": median, "low": low, "high": high, "iqm": mean} | _interval("iqm", interval)
     if pair := study.shared(method, "oracle", measure):
         ours, oracle = (interquartile_mean(values)[0] for values in pair)
         over, under = (ours, oracle) if measure.higher_is_better else (oracle, ours)
         row |= {"of_oracle": over / under if under > 0 else None, "oracle_seeds": len(pair[0])}
     return {f"{measure.key}_{name}": value for name, value in row.items()}
+
+
+def _interval(name: str, interval: Interval) -> Row:
+    return {} if interval is None else {f"{name}_low": interval[0], f"{name}_high": interval[1]}
+
+
+def _diverged(runs: Sequence[Result]) -> Row:
+    """The share of adaptations that diverged, and the replicates in which more than one in ten did."""
+    counted = [run for run in runs if run.get("adaptations")]
+    if not counted:
+        return {}
+    total = sum(run["adaptations"] for run in counted)
+    return {
+        "diverged": sum(run["diverged"] for run in counted) / total,
+        "diverged_replicates": sum(map(diverged_often, counted)),
+    }
+
+
+def _correct_for_many(rows: Sequence[Row]) -> None:
+    """Adjusts the p-values of an experiment for their number (Benjamini and Hochberg), in place."""
+    places = [(row, key) for row in rows for key in row if key.endswith("_famle_better_p")]
+    if places:
+        for (row, key), p in zip(places, stats.false_discovery_control([row[key] for row, key in places]), strict=True):
+            row[key] = float(p)
 
 
 def _times(study: Study, method: str) -> Row:
@@ -112,9 +140,10 @@ def _improvement(study: Study, method: str, measure: Measure) -> Row:
     if groups is None:
         return {}
     ours, theirs = groups if measure.higher_is_better else (-groups[0], -groups[1])
-    p, low, high = probability_of_improvement(ours, theirs, study.paired)
-    row = {"": p, "_low": low, "_high": high, "_seeds": len(theirs)}
-    return {f"{measure.key}_famle_better{name}": value for name, value in row.items()}
+    probability, interval = probability_of_improvement(ours, theirs, study.paired)
+    name = f"{measure.key}_famle_better"
+    row: Row = {name: probability, f"{name}_seeds": len(theirs)} | _interval(name, interval)
+    return row if interval is None else row | {f"{name}_p": p_value(ours, theirs, study.paired)}
 
 
 def _curves(study: Study, method: str) -> Row:
@@ -157,7 +186,7 @@ def _gaits(study: Study, method: str) -> Row:
     return {
         "success": len(gaits) / len(study.runs[method]),
         "steps_mean": np.mean(gaits) if gaits else None,
-        "steps_deviation": np.std(gaits) if gaits else None,
+        "steps_deviation": np.std(gaits, ddof=1) if len(gaits) > 1 else None,
         "famle_faster_by": np.mean(gaits) / np.mean(famle) - 1.0 if gaits and famle and method != SUBJECT else None,
     }
 
