@@ -54,7 +54,8 @@ class ModelBasedAlgorithm(BaseAlgorithm):
         reward_fn: r(s, a, s') for torch tensors (..., dim) -> (...), what the planner maximises. None takes the
             environment's ``planning_reward_fn`` or ``reward_fn``, and where it has neither the reward is learnt with
             the dynamics.
-        angle_dims: Observation dimensions that are angles in rad. None takes the environment's ``angle_dims``.
+        angle_dims: Observation dimensions that are angles in rad. None takes the environment's ``angle_dims`` unless
+            the settings say ``raw_angles``.
         quaternion_dims: The four observation dimensions of a unit quaternion, or none of them. None takes the
             environment's ``quaternion_dims``.
         pose_dims: x, y and heading of a robot on a floor, the heading as an angle or as its sine and its cosine: with
@@ -179,6 +180,8 @@ class ModelBasedAlgorithm(BaseAlgorithm):
         if not self.hyperparameters.egocentric:
             heading = known["pose_dims"][2:]
             known |= {"pose_dims": (), "angle_dims": known["angle_dims"] + (heading if len(heading) == 1 else ())}
+        if self.hyperparameters.raw_angles:
+            known |= {"angle_dims": ()}
         inherited = [name for name, chosen in names.items() if chosen is None and known[name]]
         if inherited and self.env is not None and (changed := changing_wrappers(self.env, NEW_OBSERVATIONS)):
             raise ValueError(

@@ -172,7 +172,7 @@ def test_success_rate_and_gaits_stand_beside_the_paper_s(quadruped: Path) -> Non
     table = next(row for row in ours if "32.6" in row[-1])
     assert table[2:4] == ["15.0 +- 7.1", "100 %"]
     assert table[-1] == "32.6 +- 2.3 gaits, 63.4 +- 4.5 s, 100 %"
-    assert rival[2:5] == ["40.0 +- 0.0", "50 %", "167 %"]
+    assert rival[2:5] == ["40.0", "50 %", "167 %"]
     assert rival[-1].startswith("61.8 +- 7.2 gaits, 120.1 +- 13.9 s, 40 %")
     assert rows_of(text, "AMPC, in the paper alone")[0][-1] == "0 %"
     rows = by_name(out / "quadruped-yaw.csv")
@@ -225,7 +225,7 @@ def test_many_comparisons_are_corrected_for(arm: Path) -> None:
     store_curves(arm, "famle", rng.normal(20.0, 1.0, (8, 4)).tolist())
     for name in ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml"):
         store_curves(arm, name, rng.normal(20.0, 1.0, (8, 4)).tolist())
-    store_curves(arm, "ppo", rng.normal(18.8, 1.0, (8, 4)).tolist())
+    store_curves(arm, "ppo", rng.normal(17.5, 1.0, (8, 4)).tolist())
     alone = by_name(report(arm)[1] / "reacher-paper.csv")
     p = [float(row["first_episode_famle_better_p"]) for name, row in alone.items() if name not in ("famle", "oracle")]
     assert len(p) == 5
@@ -262,7 +262,7 @@ def test_replicates_with_damages_of_their_own_are_compared_on_the_same_damage(re
     rows = by_name(out / "ant-unseen.csv")
     assert float(rows["ampc"]["return_famle_better"]) == 0.75
     assert float(rows["ampc-maml"]["return_famle_better"]) == pytest.approx(2 / 3, abs=1e-4)
-    assert "0.75 (2)" in rows_of(text, "AMPC")[-1][-1]
+    assert rows_of(text, "AMPC")[-1][-1] == "0.75"
 
 
 def test_return_of_a_robot_that_breaks_on_the_way_counts_from_then_on(results: Path) -> None:

@@ -77,12 +77,12 @@ with quartiles in round brackets; IQM is the interquartile mean with its bootstr
 as good as the oracle; in brackets stands how many seeds that is, where a method has more. *P(FAMLE better)* is the
 probability that a replicate of FAMLE does better than one of the other method, a tie counted half, with its bootstrap
 95 % interval; that is Clopper and Pearson's where all comparisons go the same way. Fewer than five replicates have no
-interval and no p. Where each seed has a damage of its own, FAMLE is compared with the other method on the same damage alone, and
-it is the fraction of damages on which it does better; in round brackets stands how many they are, where a method has
-more. p is of Wilcoxon's signed-rank test there and of Mann and Whitney's elsewhere, adjusted for all comparisons of an
-experiment (Benjamini and Hochberg). Intervals and tests take replicates for independent also where they share networks:
-the ant, the quadruped and the Minitaur have one network of each method. Deviations are those of a sample (n - 1).
-An adaptation that *diverged* left the finite numbers and was taken back; older results did not count them.""",
+interval and no p. Where each seed has a damage of its own, FAMLE is compared with the other method on the same damage
+alone, and it is the fraction of damages on which it does better; in round brackets stands how many they are, where a
+method has more. p is of Wilcoxon's signed-rank test there and of Mann and Whitney's elsewhere, adjusted for all
+comparisons of an experiment (Benjamini and Hochberg). Intervals and tests take replicates for independent also where
+they share networks: the ant, the quadruped and the Minitaur have one network of each method. Deviations are those of a
+sample (n - 1). An adaptation that *diverged* left the finite numbers and was taken back; older results did not count them.""",
     """Times of replicates are wall times on machines that did other work too, and none are given of replicates that ran
 in step as one batch; those *in one run*, where methods took turns (`python -m benchmarks.step_time`), can be compared.
 The paper's figures for the quadruped and the Minitaur are of other bodies; they stand beside ours and not against
@@ -230,7 +230,9 @@ def _count(row: Row, key: str) -> str:
 
 def _deviation(row: Row, key: str) -> str:
     mean, deviation = row.get(f"{key}_mean"), row.get(f"{key}_deviation")
-    return "-" if mean is None or deviation is None else f"{mean:.1f} +- {deviation:.1f}"
+    if mean is None:
+        return "-"
+    return f"{mean:.1f}" if deviation is None else f"{mean:.1f} +- {deviation:.1f}"
 
 
 def _share(row: Row) -> str:
