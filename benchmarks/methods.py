@@ -251,24 +251,19 @@ MAML: Mapping[str, Mapping[str, str]] = {
 }
 """The ways to meta-learn without embeddings, by the short name of the rival."""
 
-HELD: Mapping[str, Mapping[str, Any]] = {"paper": {}, "paper-held": {"action_hold": 5}}
-"""The paper's settings, and what is changed of them where random actions are held."""
-
-PAPER_NETWORKS = 30
-"""Replicates of the paper's settings, each with a network of its own."""
+PAPER: Mapping[str, tuple[int, Mapping[str, Any]]] = {"paper": (30, {}), "paper-held": (10, {"action_hold": 5})}
+"""The number of networks and what is changed of the paper's settings: nothing, or random actions that are held."""
 
 META_TRAINED: dict[str, MetaTrained] = {
-    **{f"famle-{name}": MetaTrained(name, FAMLE, "paper", PAPER_NETWORKS, held) for name, held in HELD.items()},
-    "famle-original": MetaTrained(
-        "original", FAMLE, "original", PAPER_NETWORKS, simulation={"candidates": ORIGINAL_CANDIDATES}
-    ),
+    **{f"famle-{name}": MetaTrained(name, FAMLE, "paper", n, changed) for name, (n, changed) in PAPER.items()},
+    "famle-original": MetaTrained("original", FAMLE, "original", 30, simulation={"candidates": ORIGINAL_CANDIDATES}),
     "ampc": MetaTrained("ampc", AMPC, networks=30),
-    "ampc-paper": MetaTrained("paper-ampc", AMPC, "paper", PAPER_NETWORKS),
+    "ampc-paper": MetaTrained("paper-ampc", AMPC, "paper", 30),
     **{f"ampc-{rival}": MetaTrained(rival, AMPCMAML, settings=settings) for rival, settings in MAML.items()},
     **{
-        f"ampc-{rival}-{name}": MetaTrained(f"{name}-{rival}", AMPCMAML, "paper", PAPER_NETWORKS, {**settings, **held})
+        f"ampc-{rival}-{name}": MetaTrained(f"{name}-{rival}", AMPCMAML, "paper", n, {**settings, **changed})
         for rival, settings in MAML.items()
-        for name, held in HELD.items()
+        for name, (n, changed) in PAPER.items()
     },
 }
 """Those whose meta-training the package does not ship, by name."""

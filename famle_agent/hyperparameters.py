@@ -36,8 +36,8 @@ class Hyperparameters:
         embedding_dim: Size of a situation embedding h.
         egocentric: Whether the model sees a robot's pose on a floor from the robot itself, where the environment names
             it (``pose_dims``); the paper's does not.
-        raw_angles: Whether the model sees angles as plain numbers, which jump from pi to -pi, as the authors' public code
-            does, instead of their sine and cosine.
+        raw_angles: Whether the model sees angles as plain numbers, which jump from pi to -pi, instead of their sine and
+            cosine; so does the authors' public code.
         gate_actions: Whether h scales the actions inside the model; the paper's network only concatenates it.
         interaction_rank: Rank of the products of h and the inputs in the first layer; 0 is the paper's network.
         members: Networks of the ensemble, each with its own embeddings; 1 is the paper's.

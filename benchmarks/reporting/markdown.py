@@ -82,7 +82,8 @@ alone, and it is the fraction of damages on which it does better; in round brack
 method has more. p is of Wilcoxon's signed-rank test there and of Mann and Whitney's elsewhere, adjusted for all
 comparisons of an experiment (Benjamini and Hochberg). Intervals and tests take replicates for independent also where
 they share networks: the ant, the quadruped and the Minitaur have one network of each method. Deviations are those of a
-sample (n - 1). An adaptation that *diverged* left the finite numbers and was taken back; older results did not count them.""",
+sample (n - 1). An adaptation that *diverged* left the finite numbers and was taken back; older results did not count
+them.""",
     """Times of replicates are wall times on machines that did other work too, and none are given of replicates that ran
 in step as one batch; those *in one run*, where methods took turns (`python -m benchmarks.step_time`), can be compared.
 The paper's figures for the quadruped and the Minitaur are of other bodies; they stand beside ours and not against
