@@ -12,15 +12,25 @@ ROOT = Path(__file__).parent.parent
 pytestmark = pytest.mark.usefixtures("tiny_budgets")
 
 
+TEXTS = ["README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
+
+
 @pytest.mark.slow
-def test_python_in_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("text", TEXTS)
+def test_python_in_the_texts_runs(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In order, in one namespace, as someone would who copies block after block."""
-    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
+    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / text).read_text(), re.MULTILINE | re.DOTALL)
     assert blocks
     monkeypatch.chdir(tmp_path)
     namespace: dict[str, Any] = {}
     for i, block in enumerate(blocks):
-        exec(compile(block, f"README.md, block {i}", "exec"), namespace)
+        exec(compile(block, f"{text}, block {i}", "exec"), namespace)
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_pages_that_the_texts_link_to_are_there(text: str) -> None:
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)", (ROOT / text).read_text()):
+        assert (ROOT / text).parent.joinpath(target).exists(), target
 
 
 def test_files_that_the_readme_names_are_there() -> None:
