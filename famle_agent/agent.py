@@ -20,7 +20,7 @@ from typing_extensions import Self
 
 from famle_agent.adaptation import Belief, descend
 from famle_agent.checkpoint import File, load_agent, load_pretrained, restore_agent, save_agent
-from famle_agent.dashboard import log_posterior
+from famle_agent.dashboard import log_adaptations, log_posterior
 from famle_agent.inner_loop import prepare_torch
 from famle_agent.memory import Memory, Sample, minibatches, whole_memory
 from famle_agent.online import OnlineLoop, OnlineState
@@ -133,8 +133,7 @@ class ModelBasedAgent(SimulationLearner):
         posterior = self.posterior(state)
         self.logger.record("adapt/situation", max(posterior, key=lambda name: posterior[name]), exclude="tensorboard")
         log_posterior(self.logger, self.marginals(state))
-        self.logger.record("adapt/adaptations", state.belief.adaptations)
-        self.logger.record("adapt/diverged", int(state.belief.diverged.sum()))
+        log_adaptations(self.logger, state.belief)
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
 

@@ -14,7 +14,9 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
-__all__ = ["encode_gif", "log_embeddings", "log_gif", "log_posterior"]
+from famle_agent.adaptation import Belief
+
+__all__ = ["encode_gif", "log_adaptations", "log_embeddings", "log_gif", "log_posterior"]
 
 Frames = Sequence[npt.NDArray[np.uint8]]
 
@@ -36,6 +38,12 @@ def log_posterior(logger: Logger, posterior: dict[str, float]) -> None:
     """Records P(situation | memory) of every situation, for TensorBoard alone since there are many."""
     for name, probability in posterior.items():
         logger.record(f"posterior/{name}", probability, exclude=("stdout", "log", "json", "csv"))
+
+
+def log_adaptations(logger: Logger, belief: Belief) -> None:
+    """Records how often robots have adapted, and how often that diverged, all robots together."""
+    logger.record("adapt/adaptations", belief.adaptations)
+    logger.record("adapt/diverged", int(belief.diverged.sum()))
 
 
 def log_gif(logger: Logger, tag: str, frames: Frames, fps: float, step: int) -> None:

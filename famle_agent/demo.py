@@ -16,7 +16,7 @@ from stable_baselines3.common.logger import Logger, configure
 
 from famle_agent.agent import ModelBasedAgent
 from famle_agent.contest import with_and_without_adaptation
-from famle_agent.dashboard import encode_gif, log_gif, log_posterior
+from famle_agent.dashboard import encode_gif, log_adaptations, log_gif, log_posterior
 from famle_agent.famle import FAMLE
 from famle_agent.plots import plot_returns, side_by_side
 from famle_agent.robots import known_robots
@@ -72,6 +72,7 @@ def run_episode(
             env.agent.num_timesteps += 1
             logger.record("step/reward", float(reward))
             log_posterior(logger, env.agent.marginals())
+            log_adaptations(logger, env.agent.belief)
             logger.dump(env.agent.num_timesteps)
     belief = info["famle"]
     return Episode(total, belief["situation"], belief["probability"], seconds / steps, frames)

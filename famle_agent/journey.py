@@ -16,7 +16,7 @@ from stable_baselines3.common.logger import configure
 
 from famle_agent.agent import ModelBasedAgent
 from famle_agent.contest import with_and_without_adaptation
-from famle_agent.dashboard import encode_gif, log_gif, log_posterior
+from famle_agent.dashboard import encode_gif, log_adaptations, log_gif, log_posterior
 from famle_agent.famle import FAMLE
 from famle_agent.plots import Frames, plot_paths, side_by_side
 from famle_agent.robots import known_robots
@@ -144,6 +144,7 @@ def _run(agent: ModelBasedAgent, env: gym.Env[Any, Any], seed: int, log: Path) -
         logger.record("step/y", y)
         logger.dump(t)
     log_posterior(logger, agent.marginals())
+    log_adaptations(logger, agent.belief)
     log_gif(logger, "robot/run", run.frames, _FILM_FPS, run.gaits)
     logger.close()
     return run
