@@ -251,12 +251,12 @@ MAML: Mapping[str, Mapping[str, str]] = {
 }
 """The ways to meta-learn without embeddings, by the short name of the rival."""
 
-PAPER: Mapping[str, tuple[int, Mapping[str, Any]]] = {"paper": (30, {}), "paper-held": (10, {"action_hold": 5})}
+PAPER: Mapping[str, tuple[int, Mapping[str, Any]]] = {"paper": (10, {}), "paper-held": (5, {"action_hold": 5})}
 """The number of networks and what is changed of the paper's settings: nothing, or random actions that are held."""
 
 META_TRAINED: dict[str, MetaTrained] = {
     **{f"famle-{name}": MetaTrained(name, FAMLE, "paper", n, changed) for name, (n, changed) in PAPER.items()},
-    "famle-original": MetaTrained("original", FAMLE, "original", 30, simulation={"candidates": ORIGINAL_CANDIDATES}),
+    "famle-original": MetaTrained("original", FAMLE, "original", 10, simulation={"candidates": ORIGINAL_CANDIDATES}),
     "ampc": MetaTrained("ampc", AMPC, networks=30),
     "ampc-paper": MetaTrained("paper-ampc", AMPC, "paper", 30),
     **{f"ampc-{rival}": MetaTrained(rival, AMPCMAML, settings=settings) for rival, settings in MAML.items()},

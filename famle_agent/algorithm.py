@@ -218,6 +218,7 @@ class ModelBasedAlgorithm(BaseAlgorithm):
             activation=settings.activation,
             output_limit=settings.output_limit,
             normalise_actions=settings.normalise_actions,
+            initial_weights=settings.initial_weights,
             robots=robots,
         ).to(self.device)
 

@@ -92,6 +92,8 @@ class Dynamics(nn.Module):
         output_limit: L; 0 leaves the output free.
         normalise_actions: Whether the network sees actions of zero mean and unit deviation over the data, instead of
             actions in [-1, 1].
+        initial_weights: ``"normal"`` for deviations of 1 / sqrt(inputs) and no biases, ``"uniform"`` for weights and
+            biases within 1 / sqrt(inputs), as PyTorch has them by itself and so the authors.
         robots: R, robots with networks of their own; 1 is a model that any number of robots share.
 
     Attributes:
@@ -124,6 +126,7 @@ class Dynamics(nn.Module):
         activation: Literal["silu", "relu"] = "silu",
         output_limit: float = 0.0,
         normalise_actions: bool = False,
+        initial_weights: Literal["normal", "uniform"] = "normal",
         robots: int = 1,
     ) -> None:
         super().__init__()
@@ -142,6 +145,11 @@ class Dynamics(nn.Module):
             theta[f"weight_{layer}"] = torch.randn(networks, fan_in, fan_out) / math.sqrt(fan_in)
             theta[f"bias_{layer}"] = torch.zeros(networks, fan_out)
         theta["embedding"] = torch.randn(networks, embedding_dim, sizes[1]) / math.sqrt(sizes[0] + embedding_dim)
+        if initial_weights == "uniform":
+            for layer, fan_in in enumerate((sizes[0] + embedding_dim, *hidden)):
+                names = [f"weight_{layer}", f"bias_{layer}", *(["embedding"] if layer == 0 else [])]
+                for name in names:
+                    theta[name].uniform_(-1.0 / math.sqrt(fan_in), 1.0 / math.sqrt(fan_in))
         if gate_actions:
             theta["gate"] = torch.randn(networks, embedding_dim, action_dim) / math.sqrt(embedding_dim)
         if interaction_rank:

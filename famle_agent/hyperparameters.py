@@ -45,6 +45,8 @@ class Hyperparameters:
         output_limit: L of a predicted change L tanh(z), in deviations of the data's; 0, the paper's, has no limit, the
             authors' code 10.
         normalise_actions: Whether the model sees actions of zero mean and unit deviation, as the authors' code does.
+        initial_weights: Distribution of theta before learning: ``"normal"``, or ``"uniform"`` as PyTorch has it by
+            itself, and so the authors' public code.
         degrees_of_freedom: Of the Student-t likelihood that tells situations apart; 0 is a Gaussian (the paper's).
         joint_iterations: Steps of training on all situations at once before Algorithm 1; 0 is the paper's.
         round_iterations: The same in each later round.
@@ -125,6 +127,7 @@ class Hyperparameters:
     activation: Literal["silu", "relu"] = "silu"
     output_limit: float = 0.0
     normalise_actions: bool = False
+    initial_weights: Literal["normal", "uniform"] = "normal"
     degrees_of_freedom: float = 0.0
     joint_iterations: int = 0
     round_iterations: int = 0
@@ -316,6 +319,7 @@ _AT_LEAST_ONE = {
 """The other numbers may be 0."""
 _CHOICES = {
     "activation": ("silu", "relu"),
+    "initial_weights": ("normal", "uniform"),
     "meta_learner": ("reptile", "first-order-maml", "maml"),
     "inner_optimizer": ("sgd", "adam"),
     "adapt_optimizer": (None, "sgd", "adam"),

@@ -310,6 +310,23 @@ def test_observations_are_not_touched() -> None:
     assert torch.equal(-next_obs, next_before)
 
 
+# --- initial weights --------------------------------------------------------------------------------------
+
+
+def test_initial_weights_may_be_those_of_pytorch_s_own_layers() -> None:
+    sizes = {"obs_dim": 20, "action_dim": 5, "embedding_dim": 8, "hidden": (70, 50), "members": 30}
+    torch.manual_seed(0)
+    model = Dynamics(n_situations=3, gate_actions=False, initial_weights="uniform", **sizes)
+    layers = [torch.nn.Linear(33, 70), torch.nn.Linear(70, 50), torch.nn.Linear(50, 20)]
+    for name, layer in zip(("weight_0", "weight_1", "weight_2"), layers, strict=True):
+        theirs = layer.weight.std().item()
+        assert model.theta[name].std().item() == pytest.approx(theirs, rel=0.1)
+        assert model.theta[name].abs().max() <= layer.in_features**-0.5
+        assert 0 < model.theta[name.replace("weight", "bias")].abs().max() <= layer.in_features**-0.5
+    assert model.theta["embedding"].abs().max() <= 33**-0.5
+    assert model.embeddings.std().item() == pytest.approx(1.0, rel=0.1)
+
+
 # --- normalisation ----------------------------------------------------------------------------------------
 
 
