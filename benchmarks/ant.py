@@ -21,9 +21,8 @@ from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
-import tyro
 
-from benchmarks import curves
+from benchmarks import command, curves
 from benchmarks.ant_informed import informed
 from benchmarks.compare import compare
 from benchmarks.harness import Options, Result
@@ -210,4 +209,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    command.run(main, Args)

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 import torch
-import tyro
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from benchmarks import command
 from benchmarks.ant import ADAPTS, damage_of
 from benchmarks.harness import provenance, write_json
 from benchmarks.methods import shipped
@@ -177,4 +177,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    command.run(main, Args)

@@ -15,11 +15,11 @@ import gymnasium as gym
 import numpy as np
 import pybullet
 import torch
-import tyro
 from rich.console import Console
 from rich.table import Table
 from torch import nn
 
+from benchmarks import command
 from benchmarks.ant import ENV_ID
 from benchmarks.harness import provenance, write_json
 from benchmarks.methods import shipped
@@ -158,4 +158,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    command.run(main, Args)

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 from rich.console import Console
 
+from benchmarks import command
 from benchmarks.harness import provenance, write_json
 from famle_agent import FAMLE, Transitions
 from famle_agent.adaptation import Candidates
@@ -95,4 +95,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    command.run(main, Args)

@@ -11,8 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import tyro
-
+from benchmarks import command
 from benchmarks.compare import compare
 from benchmarks.gait_robots import run
 from benchmarks.harness import Options
@@ -51,4 +50,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    command.run(main, Args)

@@ -12,8 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import tyro
-
+from benchmarks import command
 from benchmarks.compare import compare
 from benchmarks.gait_robots import run
 from benchmarks.harness import Options
@@ -65,4 +64,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    command.run(main, Args)

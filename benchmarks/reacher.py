@@ -12,9 +12,8 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
-import tyro
 
-from benchmarks import curves
+from benchmarks import command, curves
 from benchmarks.compare import compare
 from benchmarks.harness import Options, Result
 from benchmarks.methods import METHODS, PPO_METHODS
@@ -77,4 +76,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    command.run(main, Args)

@@ -26,7 +26,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
@@ -34,6 +33,7 @@ from rich.table import Table
 from scipy.stats import trim_mean
 from torch import Tensor
 
+from benchmarks import command
 from benchmarks.harness import Result, provenance, write_json
 from benchmarks.reporting.statistics import interquartile_mean, quartiles
 from famle_agent.adaptation import Candidates, adapt, prior, window_posterior
@@ -281,4 +281,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    command.run(main, Args)

@@ -18,10 +18,10 @@ import gymnasium as gym
 import numpy as np
 import pybullet
 import torch
-import tyro
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks import command
 from benchmarks.harness import provenance, write_json
 from famle_agent import FAMLE, FAMLEWrapper
 from famle_agent.demo import run_episode
@@ -133,4 +133,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    command.run(main, Args)

@@ -18,7 +18,6 @@ from typing import Any
 
 import gymnasium as gym
 import torch
-import tyro
 from rich.console import Console
 from rich.table import Table
 from stable_baselines3 import PPO
@@ -26,6 +25,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 import famle_envs  # noqa: F401 (registers the robots)
+from benchmarks import command
 from benchmarks.harness import Result, provenance, write_json
 from benchmarks.ppo import SETTINGS
 from benchmarks.reporting.study import StepTime
@@ -140,4 +140,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    command.run(main, Args)

@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import tyro
 
-from benchmarks import curves, gait_robots
+from benchmarks import command, curves, gait_robots
 from benchmarks.compare import compare
 from benchmarks.harness import Options, Result, load_results
 from benchmarks.methods import META_TRAINED, Method
@@ -205,4 +204,4 @@ ROBOTS: Mapping[str, Robot] = {
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    command.run(main, Args)

@@ -1,4 +1,7 @@
-"""``famle demo | meta-learn | run | benchmark | report``."""
+"""``famle demo | meta-learn | run``.
+
+What a command needs is imported when it runs, so that ``--help`` answers at once.
+"""
 
 from __future__ import annotations
 
@@ -7,21 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import gymnasium as gym
-import torch
 import tyro
 from rich.console import Console
 
-from benchmarks.harness import ReplicateError
-from benchmarks.reporting.report import Report
-from benchmarks.suite import Benchmark
-from famle_agent.cluster import Backend, parallel
-from famle_agent.demo import run_demo, run_episode
+from famle_agent import __version__
 from famle_agent.errors import NotLearnedError
-from famle_agent.famle import FAMLE
-from famle_agent.journey import run_journey_demo
-from famle_agent.walking import run_walking_demo
-from famle_agent.wrapper import FAMLEWrapper
 
 __all__ = ["main"]
 
@@ -53,6 +46,10 @@ class Demo:
             raise ValueError(f"The {self.robot} comes with a model; --meta-iterations is for the arm alone.")
         overrides: dict[str, Any] = {} if self.meta_iterations is None else {"meta_iterations": self.meta_iterations}
         overrides |= {"situation": self.situation} if self.situation else {}
+        from famle_agent.demo import run_demo
+        from famle_agent.journey import run_journey_demo
+        from famle_agent.walking import run_walking_demo
+
         if self.robot == "ant":
             run_walking_demo(self.robot, out=self.out, seed=self.seed, **overrides)
         elif self.robot in ("quadruped", "minitaur"):
@@ -75,7 +72,7 @@ class MetaLearn:
     """Seed of everything."""
     jobs: int = -1
     """Processes that simulate, -1 for one a core."""
-    backend: Backend = "loky"
+    backend: Literal["loky", "ray"] = "loky"
     """Where they run: on this machine, or in a Ray cluster (RAY_ADDRESS, or one that is started here)."""
     folder: Path | None = None
     """Folder for the transitions and the models on the way; the same command goes on where it was stopped."""
@@ -84,6 +81,9 @@ class MetaLearn:
 
     def __call__(self) -> None:
         """Meta-learns and saves."""
+        from famle_agent.cluster import parallel
+        from famle_agent.famle import FAMLE
+
         log = None if self.tensorboard is None else str(self.tensorboard)
         agent = FAMLE(self.robot, self.mode, seed=self.seed, tensorboard_log=log)
         with parallel(self.backend):
@@ -107,6 +107,12 @@ class Run:
 
     def __call__(self) -> None:
         """Runs the episodes and prints their returns."""
+        import gymnasium as gym
+
+        from famle_agent.demo import run_episode
+        from famle_agent.famle import FAMLE
+        from famle_agent.wrapper import FAMLEWrapper
+
         agent = FAMLE.load(self.agent)
         agent.set_random_seed(self.seed)
         robot = agent.get_env()
@@ -127,18 +133,22 @@ def main(args: list[str] | None = None) -> None:
     """Entry point of the command ``famle``.
 
     Args:
-        args: The command line without the program's name; None takes the process's own.
+        args: The command line without the program's name; None takes the process's own. ``--version`` prints the
+            version.
     """
+    if (sys.argv[1:] if args is None else args) == ["--version"]:
+        Console().print(f"famle {__version__}", highlight=False)
+        return
     command = tyro.extras.subcommand_cli_from_dict(
-        {"demo": Demo, "meta-learn": MetaLearn, "run": Run, "benchmark": Benchmark, "report": Report},
-        args=args,
-        prog="famle",
+        {"demo": Demo, "meta-learn": MetaLearn, "run": Run}, args=args, prog="famle"
     )
+    import torch
+
     if not isinstance(command, MetaLearn):
         # A plan's matrices are small: a second thread gains little, and waits long where the machine is busy.
         torch.set_num_threads(1)
     try:
         command()
-    except (ImportError, OSError, NotLearnedError, ReplicateError, TypeError, ValueError) as error:
+    except (ImportError, OSError, NotLearnedError, TypeError, ValueError) as error:
         Console(stderr=True).print(f"famle: {error}", markup=False, highlight=False)
         sys.exit(2)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ import torch
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import famle_agent
 from famle_agent import FAMLE
 from famle_agent.cli import main
 from famle_agent.demo import run_demo
@@ -102,8 +104,6 @@ def test_meta_learning_goes_on_in_its_folder(tmp_path: Path, capsys: pytest.Capt
         (["demo", "--situation", "[/joint 3 dead]"], "[/joint 3 dead]"),
         (["run", "nothing.zip"], "nothing.zip"),
         (["run", "."], "directory"),
-        (["benchmark", "reacher", "--methods", "magic"], "no method 'magic'"),
-        (["report"], "holds no results; run a benchmark first"),
     ],
 )
 def test_mistakes_end_with_advice(
@@ -149,21 +149,30 @@ def test_help_names_the_commands(capsys: pytest.CaptureFixture[str]) -> None:
         main(["--help"])
     assert caught.value.code == 0
     shown = capsys.readouterr().out
-    for command in ("demo", "meta-learn", "run", "benchmark", "report"):
+    for command in ("demo", "meta-learn", "run"):
         assert command in shown
 
 
-def test_benchmark_and_report_from_the_command_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    small = ["--replicates", "1", "--ppo-steps", "200", "--jobs", "1"]
-    main(["benchmark", "reacher", "--methods", "ppo", *small])
-    stored = json.loads((tmp_path / "benchmarks/results/reacher-paper/ppo-0.json").read_text())
-    assert sum(stored["lengths"]) > 100  # whole episodes of 200 steps
-    main(["report"])
-    assert "PPO" in (tmp_path / "benchmarks/report/report.md").read_text()
-    assert "report.md" in capsys.readouterr().out
+@pytest.mark.parametrize("command", [["famle"], [sys.executable, "-m", "famle_agent"]])
+def test_version_from_the_command_line(command: list[str]) -> None:
+    shown = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
+    assert shown.stdout.strip() == f"famle {famle_agent.__version__}"
+    assert shown.stderr == ""
+
+
+def test_help_needs_no_physics_and_no_torch() -> None:
+    code = "import sys; from famle_agent.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+    code += "print([name for name in ('torch', 'pybullet', 'gymnasium', 'benchmarks') if name in sys.modules])"
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert shown.stdout.splitlines()[-1] == "[]"
+    assert "build time" not in shown.stdout + shown.stderr  # PyBullet's greeting
+
+
+def test_public_names_are_there_when_they_are_asked_for() -> None:
+    assert {*famle_agent.__all__} <= {*dir(famle_agent)}
+    assert all(getattr(famle_agent, name) is not None for name in famle_agent.__all__)
+    with pytest.raises(AttributeError, match="has no attribute 'FAMLES'"):
+        famle_agent.FAMLES  # noqa: B018
 
 
 def test_robot_that_comes_with_a_model_is_not_taught_by_a_demo(

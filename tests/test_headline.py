@@ -65,5 +65,5 @@ def test_text_without_marks_is_left_as_it_is(tmp_path: Path) -> None:
 
 def test_readme_and_report_show_what_is_stored() -> None:
     table = headline(studies(ROOT / "benchmarks" / "results"))
-    assert table in (ROOT / "README.md").read_text(), "run: famle report --readme README.md"
+    assert table in (ROOT / "README.md").read_text(), "run: python -m benchmarks.reporting --readme README.md"
     assert table in (ROOT / "benchmarks" / "report" / "report.md").read_text()

@@ -1,1 +1,1 @@
-"""From stored results to tables, pictures and TensorBoard: ``famle report``, and what a benchmark prints at its end."""
+"""From stored results to tables, pictures and TensorBoard: ``python -m benchmarks.reporting``."""

@@ -71,8 +71,9 @@ def section(study: Study, rows: Sequence[Row], pictures: Sequence[str]) -> str:
 
 
 _HOW_TO_READ = (
-    """Made by `famle report` from stored results alone. Robot steps are counted from the damage on. Spreads are medians
-with quartiles in round brackets; IQM is the interquartile mean with its bootstrap 95 % interval in square brackets.
+    """Made by `python -m benchmarks.reporting` from stored results alone. Robot steps are counted from the damage on.
+Spreads are medians with quartiles in round brackets; IQM is the interquartile mean with its bootstrap 95 % interval in
+square brackets.
 *Of the oracle* is the ratio of IQMs over the seeds that both have, turned over where fewer is better, so that 100 % is
 as good as the oracle; in brackets stands how many seeds that is, where a method has more. *P(FAMLE better)* is the
 probability that a replicate of FAMLE does better than one of the other method, a tie counted half, with its bootstrap

@@ -1,4 +1,4 @@
-"""``famle report``: tables, pictures and TensorBoard from stored results alone; nothing is run again."""
+"""``python -m benchmarks.reporting``: tables, pictures and TensorBoard from stored results; nothing is run again."""
 
 from __future__ import annotations
 
