@@ -31,7 +31,7 @@ from benchmarks.reporting.report import show
 from benchmarks.task import Task
 from famle_agent import FAMLE, FAMLEWrapper, ModelBasedAgent
 from famle_agent.robots import known_robots
-from famle_agent.walking import BrokenRun, run_and_break
+from famle_agent.rollout import Rollout, rollout
 from famle_envs import Situation
 from famle_envs.ant import AntEnv
 from famle_envs.wrappers import RandomSituation
@@ -164,7 +164,7 @@ def run(method: str, task: Task, args: Args) -> Result:
     env = FAMLEWrapper(gym.make(ENV_ID, max_episode_steps=args.steps), agent)
     if break_at == 0:
         env.get_wrapper_attr("set_situation")(task.situation)
-    result = run_and_break(env, task.situation, args.steps, break_at, task.seed)
+    result = rollout(env, task.seed, task.situation, break_at)
     env.close()
     return _result(result, task.situation) | about(agent)
 
@@ -176,17 +176,17 @@ def run_fleet(method: str, tasks: Sequence[Task], args: Args) -> list[Result]:
     return curves.run(ANT_METHODS[method].on(tasks), tasks, steps, life, minutes=args.minutes)
 
 
-def _result(result: BrokenRun, situation: Situation) -> Result:
+def _result(result: Rollout, situation: Situation) -> Result:
     """What is stored of a run; its return counts from the damage on."""
-    bins = result.speed[: len(result.speed) // BIN * BIN].reshape(-1, BIN).mean(axis=1)
-    milliseconds = 1e3 * result.seconds
+    bins = result.reward[: result.steps // BIN * BIN].reshape(-1, BIN).mean(axis=1)
+    milliseconds = 1e3 * result.step_seconds
     return {
         "situation": str(situation),
-        "believed": result.believed[-1],
-        "return": round(float(result.speed[result.break_at :].sum()), 1),
+        "believed": result.situations[-1],
+        "return": round(float(result.reward[result.breaks_at :].sum()), 1),
         "recovery": result.recovery(WALKS),
         "speed": [round(float(value), 3) for value in bins],
-        "break_at": result.break_at,
+        "break_at": result.breaks_at,
         "ms_per_step": {
             "mean": round(float(milliseconds.mean()), 2),
             "median": round(float(np.median(milliseconds)), 2),

@@ -28,7 +28,7 @@ from famle_agent import FAMLEWrapper
 from famle_agent.dynamics import Batch, Dynamics, expand
 from famle_agent.inner_loop import InnerLoop
 from famle_agent.joint_training import JointTraining
-from famle_agent.walking import run_and_break
+from famle_agent.rollout import rollout
 
 SITUATIONS, BATCH = 20, 32
 HIDDEN = (200, 200, 100)  # the paper's network
@@ -74,7 +74,8 @@ def control_step(steps: int, threads: int) -> dict[str, float]:
     torch.set_num_threads(threads)
     agent = shipped("ant", seed=0)
     env = FAMLEWrapper(gym.make(ENV_ID, max_episode_steps=steps), agent)
-    milliseconds = 1e3 * run_and_break(env, "joint 2 dead, yaw sensor off by 60 deg", steps, steps // 3, 0).seconds[10:]
+    run = rollout(env, 0, "joint 2 dead, yaw sensor off by 60 deg", steps // 3)
+    milliseconds = 1e3 * run.step_seconds[10:]
     period = 1e3 * env.get_wrapper_attr("control_period")
     env.close()
     torch.set_num_threads(1)

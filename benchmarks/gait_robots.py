@@ -10,7 +10,7 @@ from benchmarks.harness import Result
 from benchmarks.methods import METHODS, Method, about
 from benchmarks.task import Task
 from famle_agent import FAMLEWrapper, ModelBasedAgent
-from famle_agent.journey import run_journey
+from famle_agent.rollout import rollout
 
 __all__ = ["run"]
 
@@ -24,7 +24,7 @@ def run(method: str, task: Task, known: Mapping[str, Method] = METHODS) -> Resul
         )
     agent.set_random_seed(task.seed)
     env = FAMLEWrapper(task.make(), agent)
-    journey = run_journey(env, task.seed, task.later, task.strikes_at)
+    walk = rollout(env, task.seed, task.later, None if task.later is None else task.strikes_at)
     profile = str(env.get_wrapper_attr("profile"))
     env.close()
     return {
@@ -32,11 +32,11 @@ def run(method: str, task: Task, known: Mapping[str, Method] = METHODS) -> Resul
         "later": None if task.later is None else str(task.later),
         "profile": profile,
         **about(agent),
-        "gaits": journey.gaits,
-        "reached": journey.reached,
-        "fell": journey.fell,
-        "distance": round(float(journey.path[-1, 0]), 3),
-        "believed": journey.believed[-1],
-        "path": np.round(journey.path, 3).tolist(),
-        "ms_per_plan": round(1e3 * float(np.median(journey.seconds)), 1),
+        "gaits": walk.steps,
+        "reached": walk.success,
+        "fell": walk.fell,
+        "distance": round(float(walk.position[-1, 0]), 3),
+        "believed": walk.situations[-1],
+        "path": np.round(walk.position, 3).tolist(),
+        "ms_per_plan": round(1e3 * float(np.median(walk.plan_seconds)), 1),
     }

@@ -24,7 +24,7 @@ from rich.table import Table
 from benchmarks import command
 from benchmarks.harness import provenance, write_json
 from famle_agent import FAMLE, FAMLEWrapper
-from famle_agent.demo import run_episode
+from famle_agent.rollout import rollout
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def planning(agent: FAMLE, repeats: int) -> dict[str, float]:
 def control_step(agent: FAMLE, episodes: int = 2) -> dict[str, float]:
     """A whole control step on the broken arm: plan, adaptation averaged over K, and simulation."""
     env = FAMLEWrapper(gym.make("FamleReacher-v0", situation="paper"), agent)
-    seconds = statistics.median(run_episode(env, seed=0).seconds for _ in range(episodes))
+    seconds = statistics.median(rollout(env, seed=0).step_seconds.mean() for _ in range(episodes))
     env.close()
     return {"control step (ms)": 1e3 * seconds, "control period (ms)": 100.0}
 

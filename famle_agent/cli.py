@@ -45,17 +45,11 @@ class Demo:
         if self.meta_iterations is not None and self.robot != "reacher":
             raise ValueError(f"The {self.robot} comes with a model; --meta-iterations is for the arm alone.")
         overrides: dict[str, Any] = {} if self.meta_iterations is None else {"meta_iterations": self.meta_iterations}
-        overrides |= {"situation": self.situation} if self.situation else {}
+        if self.robot == "reacher":
+            overrides["episodes"] = 1 + self.episodes  # the first one is intact
         from famle_agent.demo import run_demo
-        from famle_agent.journey import run_journey_demo
-        from famle_agent.walking import run_walking_demo
 
-        if self.robot == "ant":
-            run_walking_demo(self.robot, out=self.out, seed=self.seed, **overrides)
-        elif self.robot in ("quadruped", "minitaur"):
-            run_journey_demo(self.robot, out=self.out, seed=self.seed, **overrides)
-        else:
-            run_demo(self.robot, episodes=self.episodes, out=self.out, seed=self.seed, **overrides)
+        run_demo(self.robot, self.situation, self.out, self.seed, **overrides)
 
 
 @dataclass(frozen=True)
@@ -109,8 +103,8 @@ class Run:
         """Runs the episodes and prints their returns."""
         import gymnasium as gym
 
-        from famle_agent.demo import run_episode
         from famle_agent.famle import FAMLE
+        from famle_agent.rollout import rollout
         from famle_agent.wrapper import FAMLEWrapper
 
         agent = FAMLE.load(self.agent)
@@ -121,9 +115,9 @@ class Run:
         spec = robot.get_attr("spec")[0]
         env = FAMLEWrapper(gym.make(spec.id, **{**spec.kwargs, "situation": self.situation}), agent)
         for i in range(self.episodes):
-            episode = run_episode(env, self.seed if i == 0 else None)
+            run = rollout(env, self.seed if i == 0 else None)
             Console().print(
-                f"episode {i}: return {episode.total:.1f}, believes {episode.situation} ({episode.probability:.0%})",
+                f"episode {i}: return {run.total:.1f}, believes {run.situations[-1]} ({run.probability:.0%})",
                 markup=False,
             )
         env.close()

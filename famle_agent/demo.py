@@ -1,166 +1,202 @@
-"""A robot breaks and recovers: meta-learn, break, adapt, and show it."""
+"""Showing that a robot breaks and recovers: the same agent with adaptation and without."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 from stable_baselines3.common.logger import Logger, configure
 
-from famle_agent.agent import ModelBasedAgent
-from famle_agent.contest import with_and_without_adaptation
 from famle_agent.dashboard import encode_gif, log_adaptations, log_gif, log_posterior
 from famle_agent.famle import FAMLE
-from famle_agent.plots import plot_returns, side_by_side
+from famle_agent.plots import plot_paths, plot_returns, plot_speed, side_by_side
 from famle_agent.robots import known_robots
+from famle_agent.rollout import Rollout, rollout
 from famle_agent.wrapper import FAMLEWrapper
 
-__all__ = ["Episode", "run_demo", "run_episode"]
+__all__ = ["DEMOS", "Demo", "run_demo"]
 
-Frame = npt.NDArray[np.uint8]
+Runs = Mapping[str, Sequence[Rollout]]
+"""The episodes of each agent, by its name."""
+
+_FILM_FPS = 10.0
 
 
 @dataclass(frozen=True)
-class Episode:
-    """What happened in one episode.
+class Demo:
+    """What is shown of a robot.
 
     Attributes:
-        total: Its return.
-        situation: The most likely training situation at its end.
-        probability: How likely that one is among them.
-        seconds: Wall time per step, planning and adaptation included.
-        frames: Pictures of the robot, where they were asked for.
+        situation: What breaks, unless somebody says otherwise.
+        breaks_at: The episode and the step in it before which the robot breaks.
+        episodes: How many there are.
+        env: Arguments of the environment.
+        picture: Draws the episodes into a file.
     """
 
-    total: float
     situation: str
-    probability: float
-    seconds: float
-    frames: list[Frame] = field(default_factory=list)
-
-
-def run_episode(
-    env: FAMLEWrapper, seed: int | None = None, film: bool = False, logger: Logger | None = None
-) -> Episode:
-    """Runs the wrapped agent in its environment until the episode ends.
-
-    Args:
-        env: The environment of an agent.
-        seed: Seed of the reset.
-        film: Whether to keep a picture of each step; the environment needs ``render_mode="rgb_array"``.
-        logger: Where the reward and the posterior of each step go.
-    """
-    obs, info = env.reset(seed=seed)
-    total, seconds, steps, frames = 0.0, 0.0, 0, []
-    done = False
-    while not done:
-        start = time.perf_counter()
-        action, _ = env.agent.predict(obs)
-        obs, reward, terminated, truncated, info = env.step(action)
-        seconds += time.perf_counter() - start
-        total, steps, done = total + float(reward), steps + 1, terminated or truncated
-        if film:
-            frames.append(np.asarray(env.render()))
-        if logger is not None:
-            env.agent.num_timesteps += 1
-            logger.record("step/reward", float(reward))
-            log_posterior(logger, env.agent.marginals())
-            log_adaptations(logger, env.agent.belief)
-            logger.dump(env.agent.num_timesteps)
-    belief = info["famle"]
-    return Episode(total, belief["situation"], belief["probability"], seconds / steps, frames)
+    breaks_at: tuple[int, int]
+    episodes: int
+    picture: Callable[[Runs, gym.Env[Any, Any], Path], None]
+    env: Mapping[str, Any] = field(default_factory=dict)
 
 
 def run_demo(
-    robot: str = "reacher",
-    situation: str = "paper",
-    episodes: int = 5,
-    out: Path = Path("demo"),
-    seed: int = 0,
-    **overrides: Any,
-) -> dict[str, list[Episode]]:
-    """Meta-learns from scratch, runs one intact episode, breaks the robot, and compares with and without adaptation.
+    robot: str = "reacher", situation: str = "", out: Path = Path("demo"), seed: int = 0, **overrides: Any
+) -> dict[str, list[Rollout]]:
+    """Breaks a robot and runs it, with adaptation and without.
 
     Args:
-        robot: The robot's name.
-        situation: What breaks: a preset or a description.
-        episodes: Episodes after the break.
-        out: Folder for the agent, the curve, the film and TensorBoard.
+        robot: The robot's name. Its shipped model is used, or one is meta-learned where none is shipped.
+        situation: What breaks: a preset or a description; empty takes the robot's own.
+        out: Folder for the agent, the picture, the film and TensorBoard.
         seed: Seed of everything.
-        **overrides: Settings to change.
+        **overrides: Fields of the robot's :class:`Demo`, or settings of the agent.
 
     Returns:
-        The episodes, the intact one first, by the name of the agent.
+        The episodes of each agent, by its name.
 
     Raises:
-        ValueError: The robot or the situation is unknown.
+        ValueError: The robot, the situation or the break is unknown.
     """
-    console = Console()
-    agent = FAMLE(robot, seed=seed, tensorboard_log=str(out / "tensorboard"), **overrides)
-    env_id = known_robots()[robot].env_id
-    probe = gym.make(env_id, situation=situation)  # a wrong name should fail before minutes of learning
-    probe.close()
+    shown, settings = _demo_of(robot, overrides)
+    situation, console = situation or shown.situation, Console()
+    env = gym.make(known_robots()[robot].env_id, render_mode="rgb_array", **shown.env)
+    try:
+        # A wrong name should fail before minutes of learning.
+        env.unwrapped.set_situation(situation)  # type: ignore[attr-defined]
+        label = env.get_wrapper_attr("situation").label
+        agents = _with_and_without_adaptation(robot, seed, out, settings, console)
+        runs: dict[str, list[Rollout]] = {}
+        for name, agent in agents.items():
+            with console.status(f"Running {name} ..."):
+                runs[name] = _run(agent, env, situation, shown, seed, out / "tensorboard" / name.replace(" ", "_"))
+        console.print(_table(runs, f"{robot}: {label}"))
+        shown.picture(runs, env, out)
+        films = {name: [frame for run in episodes for frame in run.frames] for name, episodes in runs.items()}
+        (out / "robot.gif").write_bytes(encode_gif(side_by_side(films), _film_rate(env)))
+    finally:
+        env.close()
+    written = ", ".join(sorted(path.name for path in out.iterdir() if path.is_file()))
+    console.print(f"Written to {out}/: {written}; see also tensorboard --logdir {out}/tensorboard")
+    return runs
+
+
+def _demo_of(robot: str, overrides: Mapping[str, Any]) -> tuple[Demo, dict[str, Any]]:
+    """Divides what somebody changed into the demo's part and the agent's."""
+    if robot not in DEMOS:
+        raise ValueError(f"There is a demo of {', '.join(DEMOS)}, not of {robot!r}.")
+    own = {name: value for name, value in overrides.items() if name in ("breaks_at", "episodes", "env")}
+    shown = replace(DEMOS[robot], **own)
+    episode, step = shown.breaks_at
+    limit = shown.env.get("max_episode_steps")
+    if not 0 <= episode < shown.episodes or step < 0 or (limit is not None and step >= limit):
+        within = f"{shown.episodes} episodes" + ("" if limit is None else f" of {limit} steps")
+        raise ValueError(f"breaks_at, an episode and a step, must lie within {within}; got {shown.breaks_at}.")
+    return shown, {name: value for name, value in overrides.items() if name not in own}
+
+
+def _with_and_without_adaptation(
+    robot: str, seed: int, out: Path, settings: Mapping[str, Any], console: Console
+) -> dict[str, FAMLE]:
+    agent = FAMLE(robot, seed=seed, tensorboard_log=str(out / "tensorboard"), **settings)
+    if agent.dynamics is None:
+        console.print(f"[bold]FAMLE on {robot}[/bold]: meta-learning in simulation.")
+        start = time.perf_counter()
+        agent.meta_learn(progress_bar=True, n_jobs=-1)
+        console.print(f"Meta-learned {len(agent.situations)} situations in {time.perf_counter() - start:.0f} s.")
     out.mkdir(parents=True, exist_ok=True)
-    console.print(f"[bold]FAMLE on {robot}[/bold]: meta-learning in simulation, then {situation!r} breaks it.")
-    start = time.perf_counter()
-    agent.meta_learn(progress_bar=True)
-    console.print(f"Meta-learned {len(agent.situations)} situations in {time.perf_counter() - start:.0f} s.")
-    results = {}
-    for name, who in with_and_without_adaptation(agent, out).items():
-        logger = configure(str(out / "tensorboard" / name.replace(" ", "_")), ["tensorboard"])
-        with console.status(f"Running {name} ..."):
-            results[name] = _run(who, env_id, situation, episodes, seed, logger)
-        logger.close()
-    console.print(_table(results))
-    _write(results, out, f"{env_id}: {probe.get_wrapper_attr('situation')}", probe.metadata["render_fps"])
-    console.print(
-        f"Written to {out}/: returns.png, robot.gif, agent.zip; see also tensorboard --logdir {out}/tensorboard"
-    )
-    return results
+    agent.save(out / "agent.zip")
+    return {"with adaptation": agent, "without adaptation": FAMLE.load(out / "agent.zip", adapt_every=0)}
 
 
-def _run(
-    agent: ModelBasedAgent, env_id: str, situation: str, episodes: int, seed: int, logger: Logger
-) -> list[Episode]:
-    env = FAMLEWrapper(gym.make(env_id, render_mode="rgb_array"), agent)
-    agent.num_timesteps = 0
-    results = [run_episode(env, seed, film=True, logger=logger)]
-    env.get_wrapper_attr("set_situation")(situation)
-    for i in range(episodes):
-        results.append(run_episode(env, film=i in (0, episodes - 1), logger=logger))
-        logger.record("episode/return", results[-1].total)
-        logger.dump(agent.num_timesteps)
-    log_gif(logger, "robot/last_episode", results[-1].frames, env.metadata["render_fps"], agent.num_timesteps)
-    env.close()
-    return results
+def _run(agent: FAMLE, env: gym.Env[Any, Any], situation: str, shown: Demo, seed: int, log: Path) -> list[Rollout]:
+    """Runs the episodes of one agent, and logs each step, each episode and the film of the last one."""
+    agent.set_random_seed(seed)
+    env.unwrapped.set_situation(None)  # type: ignore[attr-defined]
+    wrapped, logger, runs, done = FAMLEWrapper(env, agent), configure(str(log), ["tensorboard"]), list[Rollout](), 0
+    film_every = max(1, round(1.0 / (env.get_wrapper_attr("control_period") * _FILM_FPS)))
+    for episode in range(shown.episodes):
+        breaks_at = shown.breaks_at[1] if episode == shown.breaks_at[0] else None
+        filmed = film_every if episode in (0, shown.breaks_at[0], shown.episodes - 1) else 0
+        on_step = _step_logger(logger, agent, done)
+        runs.append(rollout(wrapped, seed if episode == 0 else None, situation, breaks_at, filmed, on_step))
+        done += runs[-1].steps
+        logger.record("episode/return", runs[-1].total)
+        logger.dump(done)
+    log_gif(logger, "robot/last_episode", runs[-1].frames, _film_rate(env), done)
+    logger.close()
+    return runs
 
 
-def _table(results: dict[str, list[Episode]]) -> Table:
-    table = Table("episode", *(f"return {name}" for name in results), "the robot believes", "per step")
-    adapting = next(iter(results.values()))
-    for i, rows in enumerate(zip(*results.values(), strict=True)):
-        table.add_row(
-            f"{i} (broken)" if i else "0 (intact)",
-            *(f"{row.total:.1f}" for row in rows),
-            f"{adapting[i].situation} ({adapting[i].probability:.0%})",
-            f"{1000 * adapting[i].seconds:.0f} ms",
-        )
+def _step_logger(logger: Logger, agent: FAMLE, first: int) -> Callable[[int, float], None]:
+    def on_step(step: int, reward: float) -> None:
+        logger.record("step/reward", reward)
+        log_posterior(logger, agent.marginals())
+        log_adaptations(logger, agent.belief)
+        logger.dump(first + step)
+
+    return on_step
+
+
+def _film_rate(env: gym.Env[Any, Any]) -> float:
+    """Pictures per second of the film; a robot of one action a second is shown faster than it is."""
+    return min(_FILM_FPS, max(4.0, 1.0 / float(env.get_wrapper_attr("control_period"))))
+
+
+def _table(runs: Runs, title: str) -> Table:
+    """One row an episode; one that the robot breaks in has two, with the return of 1,000 steps at that rate."""
+    table = Table("episode", *(f"return {name}" for name in runs), "believes at the end", "per step", title=title)
+    adapting = next(iter(runs.values()))
+    for i, run in enumerate(adapting):
+        cells = [_outcome(episodes[i]) for episodes in runs.values()]
+        milliseconds = f"{1e3 * np.median(run.step_seconds):.0f} ms"
+        table.add_row(str(i), *cells, f"{run.situations[-1]} ({run.probability:.0%})", milliseconds)
     return table
 
 
-def _write(results: dict[str, list[Episode]], out: Path, title: str, fps: float) -> None:
-    plot_returns({name: [row.total for row in rows] for name, rows in results.items()}, title, out / "returns.png")
-    adapting, frozen = results.values()
-    films = {
-        "intact": adapting[0].frames,
-        "broken, without adaptation": frozen[-1].frames,
-        "broken, with adaptation": adapting[-1].frames,
-    }
-    (out / "robot.gif").write_bytes(encode_gif(side_by_side(films), fps))
+def _outcome(run: Rollout) -> str:
+    ending = " at the goal" if run.success else " fell" if run.fell else ""
+    parts = [f"{run.total:.1f} in {run.steps} steps{ending}"]
+    if run.breaks_at:
+        before, after = run.reward[: run.breaks_at].mean(), run.reward[run.breaks_at :].mean()
+        parts.append(f"a step {before:.2f} before the break, {after:.2f} after")
+    return ", ".join(parts)
+
+
+# --- the robots -------------------------------------------------------------------------------------------------------
+
+
+def _draw_returns(runs: Runs, env: gym.Env[Any, Any], out: Path) -> None:
+    returns = {name: [run.total for run in episodes] for name, episodes in runs.items()}
+    plot_returns(returns, f"{env.spec.id if env.spec else ''}", out / "returns.png")
+
+
+def _draw_speed(runs: Runs, env: gym.Env[Any, Any], out: Path) -> None:
+    speed = {name: episodes[-1].reward for name, episodes in runs.items()}
+    broken = next(iter(runs.values()))[-1]
+    rate = 1.0 / env.get_wrapper_attr("control_period")
+    plot_speed(speed, broken.breaks_at or 0, rate, env.get_wrapper_attr("situation").label, out / "speed.png")
+
+
+def _draw_path(runs: Runs, env: gym.Env[Any, Any], out: Path) -> None:
+    paths = {name: episodes[-1].position for name, episodes in runs.items()}
+    goal = env.get_wrapper_attr("goal") if env.has_wrapper_attr("goal") else None
+    title = f"{env.get_wrapper_attr('situation').label}, profile {str(env.get_wrapper_attr('profile'))!r}"
+    plot_paths(paths, title, out / "path.png", goal)
+
+
+DEMOS: Mapping[str, Demo] = {
+    "reacher": Demo("paper", (1, 0), 6, _draw_returns),
+    "ant": Demo("joint 2 dead, yaw sensor off by 60 deg", (0, 300), 1, _draw_speed, {"max_episode_steps": 900}),
+    "quadruped": Demo("paper", (0, 0), 1, _draw_path, {"profile": "reality"}),
+    "minitaur": Demo("intact", (0, 0), 1, _draw_path, {"profile": "reality"}),
+}
+"""What is shown of each robot."""

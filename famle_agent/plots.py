@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from PIL import Image, ImageDraw
 
-__all__ = ["Frames", "plot_paths", "plot_returns", "plot_speed", "running_mean", "side_by_side", "style"]
+from famle_agent.rollout import Frames, running_mean
 
-Frames = Sequence[npt.NDArray[np.uint8]]
+__all__ = ["plot_paths", "plot_returns", "plot_speed", "side_by_side", "style"]
 
 
 def style(axes: Axes, xlabel: str, ylabel: str, title: str = "") -> None:
@@ -45,15 +45,6 @@ def plot_returns(returns: Mapping[str, Sequence[float]], title: str, path: str |
     style(axes, "episode", "return", title)
     axes.legend()
     figure.savefig(path, dpi=150)
-
-
-def running_mean(values: npt.NDArray[Any], window: int) -> npt.NDArray[Any]:
-    """The mean of the last ``window`` values at each place, of fewer where there are not as many yet."""
-    total = np.concatenate([[0.0], np.cumsum(values)])
-    end = np.arange(1, len(values) + 1)
-    start = np.maximum(0, end - window)
-    mean: npt.NDArray[Any] = (total[end] - total[start]) / (end - start)
-    return mean
 
 
 def plot_speed(

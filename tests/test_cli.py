@@ -6,54 +6,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from PIL import Image
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import famle_agent
 from famle_agent import FAMLE
 from famle_agent.cli import main
-from famle_agent.demo import run_demo
 from famle_envs.reacher import ReacherEnv
 
 pytestmark = pytest.mark.usefixtures("tiny_budgets")
-
-
-def scalars(folder: Path) -> list[str]:
-    events = EventAccumulator(str(folder))
-    events.Reload()
-    return events.Tags()["scalars"]
-
-
-@pytest.mark.slow
-def test_demo_writes_all_it_promises(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "results" / "demo"
-    main(["demo", "--out", str(out), "--episodes", "2", "--meta-iterations", "2", "--situation", "joint 3 dead"])
-    assert Image.open(out / "returns.png").size[0] > 100
-    film = Image.open(out / "robot.gif")
-    assert film.n_frames > 1
-    assert film.size[0] > 2.5 * film.size[1]  # three films next to each other
-    agent = FAMLE.load(out / "agent.zip", device="cpu")
-    assert agent.hyperparameters.meta_iterations == 2
-    assert len(agent.situations) == 11
-    agent.get_env().close()
-    assert "meta/loss_after" in scalars(out / "tensorboard" / "FAMLE_meta_1")
-    for name in ("with_adaptation", "without_adaptation"):
-        assert {"step/reward", "episode/return", "posterior/joint 3 dead"} <= set(scalars(out / "tensorboard" / name))
-    shown = capsys.readouterr().out
-    assert "broken" in shown
-    assert "returns.png" in shown
-
-
-@pytest.mark.slow
-def test_demo_gives_its_episodes(tmp_path: Path) -> None:
-    results = run_demo(situation="joint 0 reversed", episodes=1, out=tmp_path, seed=1, candidates=5)
-    assert list(results) == ["with adaptation", "without adaptation"]
-    for episodes in results.values():
-        assert len(episodes) == 2
-        assert all(0 < episode.total < 6 and episode.seconds > 0 for episode in episodes)
-        assert all(len(episode.frames) == 6 for episode in episodes)
-        assert all(0 <= episode.probability <= 1 for episode in episodes)
-    assert results["without adaptation"][1].probability == pytest.approx(1 / 11)
 
 
 def test_meta_learned_agent_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -182,3 +141,9 @@ def test_robot_that_comes_with_a_model_is_not_taught_by_a_demo(
         main(["demo", "--robot", "ant", "--meta-iterations", "2", "--out", str(tmp_path / "out")])
     assert "--meta-iterations is for the arm alone" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_command_line_knows_which_robots_it_can_show(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["demo", "--robot", "octopus"])
+    assert "ant" in capsys.readouterr().err

@@ -9,7 +9,7 @@ import pytest
 
 from famle_agent import FAMLE, FAMLEWrapper
 from famle_agent.robots import known_robots
-from famle_agent.walking import run_and_break
+from famle_agent.rollout import rollout
 
 MakeEnv = Callable[..., gym.Env[Any, Any]]
 
@@ -49,12 +49,12 @@ def test_another_control_rate_is_another_world(make_env: MakeEnv) -> None:
 def test_ant_walks_at_once_and_again_after_it_broke(agent: FAMLE, make_env: MakeEnv) -> None:
     agent.forget()
     agent.set_random_seed(0)
-    env = FAMLEWrapper(make_env("FamleAnt-v0"), agent)
-    run = run_and_break(env, "joint 4 dead, yaw sensor off by 100 deg", steps=330, break_at=150, seed=0)
-    assert run.speed[100:150].mean() > 0.8
-    assert run.speed[-100:].mean() > 0.8
-    assert run.believed[149] == "intact"
-    assert run.believed[-1] in ("joint 4 dead + yaw sensor off by 90 deg", "joint 4 dead + yaw sensor off by 120 deg")
+    env = FAMLEWrapper(make_env("FamleAnt-v0", max_episode_steps=330), agent)
+    run = rollout(env, 0, "joint 4 dead, yaw sensor off by 100 deg", breaks_at=150)
+    assert run.reward[100:150].mean() > 0.8
+    assert run.reward[-100:].mean() > 0.8
+    assert run.situations[149] == "intact"
+    assert run.situations[-1] in ("joint 4 dead + yaw sensor off by 90 deg", "joint 4 dead + yaw sensor off by 120 deg")
 
 
 @pytest.mark.slow

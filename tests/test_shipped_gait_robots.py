@@ -7,8 +7,8 @@ import gymnasium as gym
 import pytest
 
 from famle_agent import FAMLE, FAMLEWrapper
-from famle_agent.journey import run_journey
 from famle_agent.robots import known_robots
+from famle_agent.rollout import rollout
 
 MakeEnv = Callable[..., gym.Env[Any, Any]]
 ROBOTS = {"quadruped": 20, "minitaur": 9}
@@ -39,9 +39,9 @@ def test_shipped_model_serves_any_goal(make_env: MakeEnv) -> None:
     for goal in ((0.0, 1.0), (-1.0, -0.5)):
         env = make_env("FamleQuadruped-v0", goal=goal)
         served = FAMLE(env, seed=0, device="cpu")
-        run = run_journey(FAMLEWrapper(env, served), seed=0)
-        assert run.reached
-        assert run.gaits < 20
+        run = rollout(FAMLEWrapper(env, served), seed=0)
+        assert run.success
+        assert run.steps < 20
 
 
 @pytest.mark.slow
@@ -50,7 +50,7 @@ def test_quadruped_reaches_its_goal_in_reality(situation: str, make_env: MakeEnv
     agent = FAMLE("quadruped", seed=0, device="cpu")
     agent.get_env().close()
     env = make_env("FamleQuadruped-v0", situation=situation, profile="reality")
-    assert run_journey(FAMLEWrapper(env, agent), seed=0).reached
+    assert rollout(FAMLEWrapper(env, agent), seed=0).success
 
 
 @pytest.mark.slow
@@ -58,6 +58,6 @@ def test_minitaur_walks_in_reality(make_env: MakeEnv) -> None:
     agent = FAMLE("minitaur", seed=0, device="cpu")
     agent.get_env().close()
     env = make_env("FamleMinitaur-v0", profile="reality", max_episode_steps=20)
-    run = run_journey(FAMLEWrapper(env, agent), seed=0)
+    run = rollout(FAMLEWrapper(env, agent), seed=0)
     assert not run.fell
-    assert run.path[-1, 0] > 2.0
+    assert run.position[-1, 0] > 2.0
