@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from famle_agent.agent import ModelBasedAgent
     from famle_agent.baselines import AMPC, AMPCMAML
+    from famle_agent.controller import OnlineState
     from famle_agent.errors import NotLearnedError
     from famle_agent.famle import FAMLE
     from famle_agent.hyperparameters import Hyperparameters
-    from famle_agent.online import OnlineState
     from famle_agent.transitions import Transitions
     from famle_agent.wrapper import FAMLEWrapper
 
@@ -42,7 +42,7 @@ _MODULES = {
     "Hyperparameters": "hyperparameters",
     "ModelBasedAgent": "agent",
     "NotLearnedError": "errors",
-    "OnlineState": "online",
+    "OnlineState": "controller",
     "Transitions": "transitions",
 }
 

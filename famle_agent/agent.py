@@ -18,13 +18,14 @@ from stable_baselines3.common.utils import safe_mean
 from torch import Tensor
 from typing_extensions import Self
 
-from famle_agent.adaptation import Belief, descend
+from famle_agent.adaptation import Belief
 from famle_agent.checkpoint import File, load_agent, load_pretrained, restore_agent, save_agent
+from famle_agent.controller import Adapter, Controller, OnlineState
 from famle_agent.dashboard import log_adaptations, log_posterior
+from famle_agent.dynamics import Dynamics
 from famle_agent.inner_loop import prepare_torch
-from famle_agent.memory import Memory, Sample, minibatches, whole_memory
-from famle_agent.online import OnlineLoop, OnlineState
-from famle_agent.planning import Model, Planner, RewardFn, bounded
+from famle_agent.memory import Memory
+from famle_agent.planning import Planner, RewardFn
 from famle_agent.simulation import SimulationLearner
 from famle_agent.units import check_action, check_observation, to_action_space
 
@@ -39,8 +40,8 @@ Array = npt.NDArray[Any]
 class ModelBasedAgent(SimulationLearner):
     """An agent that learns a model in simulation, adapts it on the robot, and plans with it.
 
-    Subclasses say how the model is learnt (:meth:`_learn_model`) and how it is adapted (:meth:`_prior`,
-    :meth:`_adapt`). Arguments as for :class:`~famle_agent.algorithm.ModelBasedAlgorithm`.
+    Subclasses say how the model is learnt (:meth:`_learn_model`) and what adapts it (:meth:`_new_adapter`). Arguments
+    as for :class:`~famle_agent.algorithm.ModelBasedAlgorithm`.
     """
 
     planner: Planner
@@ -51,25 +52,40 @@ class ModelBasedAgent(SimulationLearner):
         super()._setup_model()
         self.planner = self.hyperparameters.make_planner()
         self._live = self._served = None
+        self._known_adapter: tuple[tuple[Any, ...], Adapter] | None = None
         self._warned_of_divergence = False
         if self.hyperparameters.adaptation(seen=1).steps:
             prepare_torch()
 
     @abstractmethod
-    def _prior(self, robots: int) -> Belief:
-        """What B robots believe before they have seen anything."""
+    def _new_adapter(self, model: Dynamics) -> Adapter:
+        """Makes what adapts a meta-learned model."""
 
-    @abstractmethod
-    def _log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
-        """How well each candidate explains a transition of each of B robots, (B, C), and how well its belief, (B,)."""
+    @property
+    def adapter(self) -> Adapter:
+        """What adapts the agent's model.
 
-    @abstractmethod
-    def _infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
-        """The belief with a posterior that knows of the newest transition of the robots that ``moved`` (B,)."""
+        Raises:
+            NotLearnedError: The agent has no model yet.
+        """
+        model = self._require_dynamics()
+        # A tensor counts how often it was written to: learning, loading and set_parameters change a model in place.
+        known = model, model.embeddings._version, self.hyperparameters, self.seed
+        if self._known_adapter is None or self._known_adapter[0] != known:
+            self._known_adapter = known, self._new_adapter(model)
+        return self._known_adapter[1]
 
-    @abstractmethod
-    def _adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
-        """What B robots believe after the transitions in their memory, and what of these still counts then."""
+    @property
+    def controller(self) -> Controller:
+        """Algorithm 2 with the agent's adapter, planner and reward.
+
+        Raises:
+            NotLearnedError: The agent has no model yet.
+            ValueError: The agent has no reward.
+        """
+        settings = self.hyperparameters
+        how = settings.adapt_every, settings.adapt_at_reset, settings.forget_at_reset
+        return Controller(self.adapter, self.planner, self._unit_reward_fn(), *how)
 
     def learn(
         self,
@@ -101,15 +117,16 @@ class ModelBasedAgent(SimulationLearner):
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         hooks.on_training_start(locals(), globals())
-        loop, state = self._loop(), self._state_of(env.num_envs)
+        controller, state = self.controller, self._state_of(env.num_envs)
         starts = torch.as_tensor(self._last_episode_starts, dtype=torch.bool, device=self.device)
         nobody = torch.zeros_like(starts)
         while self.num_timesteps < total_timesteps:
             hooks.on_rollout_start()
-            action, state = loop.act(state, self._tensor(self._last_obs), starts, self._generator)
+            action, state = controller.act(state, self._tensor(self._last_obs), starts, self._generator)
             new_obs, rewards, dones, infos = env.step(self._to_env(action))
             self.num_timesteps += env.num_envs
-            state = self._live = loop.remember(state, self._tensor(_before_reset(new_obs, dones, infos)), nobody)
+            reached = self._tensor(_before_reset(new_obs, dones, infos))
+            state = self._live = self._observed(controller.observe(state, reached, nobody))
             self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
             starts = torch.as_tensor(dones, device=self.device)
             self._update_info_buffer(infos, dones)
@@ -166,7 +183,7 @@ class ModelBasedAgent(SimulationLearner):
             NotLearnedError: The agent has no model yet.
             ValueError: The observation has the wrong shape or is not finite.
         """
-        loop = self._loop()
+        controller = self.controller
         numbers = check_observation(observation, self.observation_space)
         obs = self._tensor(np.atleast_2d(numbers))
         starts = torch.zeros(len(obs), dtype=torch.bool, device=self.device)
@@ -181,11 +198,12 @@ class ModelBasedAgent(SimulationLearner):
         if deterministic:
             generator = torch.Generator(self.device).manual_seed(self.seed or 0)
         if state is None:
-            action, state = loop.act(self._state_of(len(obs)), obs, starts, generator)
+            action, state = controller.act(self._state_of(len(obs)), obs, starts, generator)
             if self._live is not None and self._live.robots == len(obs):
                 self._live = replace(self._live, plan=state.plan)  # a loop that drops the state keeps its plan
         else:
-            action, state = loop.act(loop.remember(state, obs, starts), obs, starts, generator)
+            action, state = controller.act(controller.observe(state, obs, starts), obs, starts, generator)
+        self._observed(state)
         actions = self._to_env(action)
         return (actions[0] if numbers.ndim == 1 else actions), state
 
@@ -201,19 +219,20 @@ class ModelBasedAgent(SimulationLearner):
             NotLearnedError: The agent has no model yet.
             ValueError: A shape is wrong, or a value is not finite.
         """
-        loop, space = self._loop(), self.observation_space
+        controller, space = self.controller, self.observation_space
         s, s_next = (self._tensor(np.atleast_2d(check_observation(o, space))) for o in (obs, next_obs))
         a = self._tensor(np.atleast_2d(check_action(action, self.action_space)))
         if not len(s) == len(a) == len(s_next):
             raise ValueError(f"Got {len(s)} observations, {len(a)} actions and {len(s_next)} next observations.")
         state = replace(self._state_of(len(s)), last=(s, self._action_scale().to_unit(a).clamp(-1.0, 1.0)))
-        self._live = loop.remember(state, s_next, torch.zeros(len(s), dtype=torch.bool, device=self.device))
+        moved = torch.zeros(len(s), dtype=torch.bool, device=self.device)
+        self._live = self._observed(controller.observe(state, s_next, moved))
 
     def begin_episode(self) -> None:
         """Tells the agent that its robot was reset: its plan is void, its memory stays."""
         if self._live is not None:
             starts = torch.ones(self._live.robots, dtype=torch.bool, device=self.device)
-            self._live = self._loop().reset(self._live, starts)
+            self._live = self._observed(self.controller.reset(self._live, starts))
 
     def forget(self) -> None:
         """Returns to what was meta-learned, as for a robot that was just repaired."""
@@ -246,60 +265,27 @@ class ModelBasedAgent(SimulationLearner):
     def marginals(self, state: OnlineState | None = None) -> dict[str, float]:
         """How likely each training situation is, alone or as a part of what is wrong; arguments as there."""
 
-    def _loop(self) -> OnlineLoop:
-        model = self._require_dynamics()
-        return OnlineLoop(
-            prior=self._prior,
-            log_likelihood=self._log_likelihood,
-            infer=self._infer,
-            adapt=self._adapt,
-            simulator=self._simulator,
-            reward_fn=self._unit_reward_fn(),
-            planner=self.planner,
-            members=model.members,
-            adapt_every=self.hyperparameters.adapt_every,
-            adapt_at_reset=self.hyperparameters.adapt_at_reset,
-            forget_at_reset=self.hyperparameters.forget_at_reset,
-        )
-
-    def _simulator(self, belief: Belief, memory: Memory) -> Model:
-        model = self._require_dynamics()
-        simulator = model.simulator(belief.theta, belief.h)
-        if not self.hyperparameters.clamp_predictions or belief.adaptations == 0:
-            return simulator
-        low, high = (bound.repeat_interleave(model.members, dim=0) for bound in memory.range())
-        return bounded(simulator, low, high)
-
-    def _descend(self, start: Belief, memory: Memory) -> Belief:
-        """Line 7: k gradient steps from where a belief is. Warns of the first ones that diverge."""
-        settings, model = self.hyperparameters, self._require_dynamics()
-        steps, sample = settings.adaptation(memory.seen), self._sample(start.adaptations - 1)
-        adapted = descend(model, start, memory, steps, settings.validation_size, sample)
-        if steps.steps and not self._warned_of_divergence and (adapted.diverged > start.diverged).any():
+    def _observed(self, state: OnlineState) -> OnlineState:
+        """Passes a state on, and warns of the first adaptation that diverged."""
+        if not self._warned_of_divergence and state.belief.diverged.any():
             self._warned_of_divergence = True
             warnings.warn(
-                f"Adaptation {adapted.adaptations} diverged: its gradient steps left the finite numbers and were taken "
-                "back. Take smaller rates (adapt_lr, adapt_embedding_lr), or meta-learn on data that reach where the "
-                'robot is (action_hold, episode_length, rounds). info["famle"]["diverged"] and adapt/diverged count '
-                "them from here on.",
-                stacklevel=2,
+                f"Adaptation {state.belief.adaptations} diverged: its gradient steps left the finite numbers and were "
+                "taken back. Take smaller rates (adapt_lr, adapt_embedding_lr), or meta-learn on data that reach where "
+                'the robot is (action_hold, episode_length, rounds). info["famle"]["diverged"] and adapt/diverged '
+                "count them from here on.",
+                stacklevel=3,
             )
-        return adapted
-
-    def _sample(self, number: int) -> Sample:
-        """What gradient steps of an adaptation see; the same for the same number, as a deterministic agent promises."""
-        if not (size := self.hyperparameters.adapt_batch_size):
-            return whole_memory
-        chance = torch.Generator(self.device).manual_seed(1_000_003 * (self.seed or 0) + number)
-        return minibatches(size, chance)
+        return state
 
     def _state_of(self, robots: int) -> OnlineState:
         """What the agent believes now where that fits the number of robots, else what it meta-learned."""
         if self._live is not None and self._live.robots == robots:
             return replace(self._live, last=None)
-        model, M, W = self._require_dynamics(), self.hyperparameters.memory_size, self.hyperparameters.selection_window
-        C = self._prior(robots).log_posterior.shape[1]
-        return self._loop().begin(Memory.empty(robots, M, model.obs_dim, model.action_dim, C, self.device, W))
+        model = self._require_dynamics()
+        M, W = self.hyperparameters.memory_size, self.hyperparameters.selection_window
+        C = self.adapter.initial(robots).log_posterior.shape[1]
+        return self.controller.init(Memory.empty(robots, M, model.obs_dim, model.action_dim, C, self.device, W))
 
     # --- saving and loading -----------------------------------------------------------------------------
 

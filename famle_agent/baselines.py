@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, ClassVar
 
-import torch
-from torch import Tensor
-
-from famle_agent.adaptation import Belief
+from famle_agent.adapters import GradientAdapter
 from famle_agent.agent import ModelBasedAgent
-from famle_agent.memory import Memory
-from famle_agent.online import OnlineState
+from famle_agent.controller import OnlineState
+from famle_agent.dynamics import Dynamics
 from famle_agent.simulation import Round
 from famle_agent.transitions import Transitions
 
@@ -49,26 +45,8 @@ class _OneModelAgent(ModelBasedAgent):
         """As :meth:`posterior`."""
         return self.posterior(state)
 
-    def _prior(self, robots: int) -> Belief:
-        model = self._require_dynamics()
-        none = torch.zeros(robots, dtype=torch.long, device=self.device)
-        theta, h = model.theta_of(robots), model.embeddings_of(none)
-        return Belief(theta, h, torch.zeros(robots, 1, device=self.device), candidate=none, diverged=none)
-
-    def _log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
-        nothing = torch.zeros(len(obs), device=self.device)
-        return nothing[:, None], nothing
-
-    def _infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
-        return belief
-
-    def _adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
-        """Theta* = k gradient steps on the last M transitions, from theta_meta (the paper's eq. 3) or going on."""
-        settings = self.hyperparameters
-        start = belief if settings.keep_adapting else self._prior(len(memory.weight))
-        return memory, self._descend(
-            replace(start, diverged=belief.diverged, adaptations=belief.adaptations + 1), memory
-        )
+    def _new_adapter(self, model: Dynamics) -> GradientAdapter:
+        return GradientAdapter(model, self.hyperparameters, self.seed or 0)
 
 
 class AMPC(_OneModelAgent):

@@ -19,10 +19,10 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
+from famle_agent.controller import OnlineState
 from famle_agent.envs import env_attribute, make_env
 from famle_agent.hyperparameters import Hyperparameters
 from famle_agent.observation import DIMS
-from famle_agent.online import OnlineState
 from famle_agent.robots import known_robots
 from famle_agent.whole_file import whole_file
 
@@ -254,7 +254,8 @@ def _restore_tensors(agent: ModelBasedAgent, tensors: dict[str, Tensor], live: d
         stored = OnlineState.from_tensors(state, **live)
         stored = stored.resized(settings.memory_size, settings.selection_window, settings.horizon)
         # With other candidates than the stored agent's, what it has seen cannot be judged by what it knew of them.
-        comparable = stored.belief.log_posterior.shape == agent._prior(stored.robots).log_posterior.shape
+        begins = agent.adapter.initial(stored.robots)
+        comparable = stored.belief.log_posterior.shape == begins.log_posterior.shape
         agent._live = stored if comparable else None
     if agent.device.type == "cpu" and "generator/state" in tensors:
         agent._generator.set_state(tensors["generator/state"])

@@ -140,7 +140,7 @@ def test_candidates_follow_what_is_learnt(transitions: Transitions) -> None:
     agent.get_env().close()
     agent.meta_learn(transitions, callback=lambda local, _: bool(local["self"].posterior()))
     expected = Candidates.of(agent.dynamics, compose=True)
-    torch.testing.assert_close(agent._candidates().h, expected.h)
+    torch.testing.assert_close(agent.candidates.h, expected.h)
 
 
 def test_candidates_follow_the_settings(ensemble: FAMLE) -> None:

@@ -124,7 +124,7 @@ def test_agent_begins_anew_where_the_situation_changes(load: Load, data: Transit
     for before, after, anew in after_each_adaptation(agent, data, [REVERSED], range(30, 39)):
         if anew.all():
             began += 1
-            expected = descend(model, select(model, agent._candidates(), after), memory(agent), steps)
+            expected = descend(model, select(model, agent.candidates, after), memory(agent), steps)
             torch.testing.assert_close(after.h, expected.h)
             torch.testing.assert_close(after.theta, expected.theta)
             assert not torch.equal(before.h, after.h)
@@ -142,7 +142,7 @@ def imagined(agent: FAMLE, belief: Belief, data: Transitions) -> Tensor:
 def planned_with(agent: FAMLE, data: Transitions) -> Tensor:
     """The same of the model that the agent plans with."""
     obs, action = (torch.as_tensor(values[DEAD, :20])[None] for values in (data.obs, data.action))
-    return agent._simulator(agent.belief, memory(agent))(obs, action)
+    return agent.adapter.model_for(agent.belief, memory(agent))(obs, action)
 
 
 def test_adapted_model_plans_where_no_embedding_is_better(load: Load, data: Transitions) -> None:
@@ -155,7 +155,7 @@ def test_adapted_model_plans_where_no_embedding_is_better(load: Load, data: Tran
 def test_embedding_alone_plans_while_steps_lead_astray_and_nothing_is_forgotten(load: Load, data: Transitions) -> None:
     agent = load(adapt_lr=0.3)
     tell(agent, data, [DEAD], range(30))
-    selected = select(agent._require_dynamics(), agent._candidates(), agent.belief)
+    selected = select(agent._require_dynamics(), agent.candidates, agent.belief)
     assert better_explained(memory(agent), selected.candidate).all()
     assert selected.candidate.tolist() == agent.belief.candidate.tolist() == [DEAD]
     assert memory(agent).seen > 2 * WINDOW

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
@@ -80,19 +81,20 @@ def load(file: Path) -> Iterator[Load]:
 def counted(agent: FAMLE, door: str, episodes: int) -> list[int]:
     """How often the agent has adapted when it plans each action, however it is told what happens."""
     counts: list[int] = []
-    plan = agent._simulator
+    kind = type(agent.adapter)
+    plan = kind.model_for
 
-    def simulator(belief: Any, memory: Any) -> Any:
+    def model_for(self: Any, belief: Any, memory: Any) -> Any:
         counts.append(belief.adaptations)
-        return plan(belief, memory)
+        return plan(self, belief, memory)
 
-    agent._simulator = simulator  # type: ignore[method-assign]
-    if door == "learn":
-        agent.learn(episodes * EPISODE)
-    elif door == "state":
-        evaluate_policy(agent, agent.get_env(), n_eval_episodes=episodes, warn=False)
-    else:
-        wrapped(agent, episodes)
+    with patch.object(kind, "model_for", model_for):
+        if door == "learn":
+            agent.learn(episodes * EPISODE)
+        elif door == "state":
+            evaluate_policy(agent, agent.get_env(), n_eval_episodes=episodes, warn=False)
+        else:
+            wrapped(agent, episodes)
     return counts
 
 
@@ -254,12 +256,12 @@ def test_predictions_are_bounded_from_the_first_adaptation_on(data: Transitions,
         agent.observe(data.obs[two, i], data.action[two, i], data.next_obs[two, i])
         state = agent._state_of(2)
         free = agent._require_dynamics().simulator(state.belief.theta, state.belief.h)(far, action)
-        assert torch.equal(agent._simulator(state.belief, state.memory)(far, action), free)
+        assert torch.equal(agent.adapter.model_for(state.belief, state.memory)(far, action), free)
     agent.begin_episode()
     state = agent._state_of(2)
     seen = torch.from_numpy(np.concatenate([data.obs[two, :EPISODE], data.next_obs[two, :EPISODE]], axis=1))
     for sign in (-1.0, 1.0):
-        reached = agent._simulator(state.belief, state.memory)(sign * far, action).view(2, members, 12)
+        reached = agent.adapter.model_for(state.belief, state.memory)(sign * far, action).view(2, members, 12)
         assert (reached >= seen.amin(dim=1, keepdim=True)).all()
         assert (reached <= seen.amax(dim=1, keepdim=True)).all()
     agent.get_env().close()

@@ -122,7 +122,7 @@ def test_posterior_knows_of_each_transition_at_once(load_agent: Load, transition
     agent = load_agent(hazard=hazard, adapt_every=5, adapt_steps=1, memory_size=20, selection_size=0)
     beliefs = tell(agent, transitions, [3, 8], range(12))
     assert agent.belief.adaptations == 2
-    for earlier, later in zip([agent._prior(2).posterior, *beliefs], beliefs, strict=False):
+    for earlier, later in zip([agent.adapter.initial(2).posterior, *beliefs], beliefs, strict=False):
         assert not torch.allclose(earlier, later, rtol=1e-6, atol=0.0)
     for belief in beliefs[-2:]:
         assert belief.argmax(dim=1).tolist() == [3, 8]

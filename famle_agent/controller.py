@@ -1,9 +1,12 @@
-"""The loop of Algorithm 2 on B robots in step with each other: remember, adapt every K steps, plan."""
+"""Algorithm 2 of the paper on B robots at once: observe a transition, adapt every K steps, plan the next action.
+
+State is a value: each call takes one and returns another, as a recurrent policy does with its hidden state.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -12,7 +15,7 @@ from famle_agent.adaptation import Belief
 from famle_agent.memory import Memory
 from famle_agent.planning import Model, Planner, RewardFn, imagine, shift
 
-__all__ = ["OnlineLoop", "OnlineState"]
+__all__ = ["Adapter", "Controller", "OnlineState"]
 
 
 @dataclass(frozen=True)
@@ -71,45 +74,57 @@ class OnlineState:
         return cls(Memory(**part("memory.")), belief, tensors["plan"], steps=steps, adapted_at=adapted_at)
 
 
+class Adapter(Protocol):
+    """Turns what robots have gone through into the model that they plan with."""
+
+    @property
+    def members(self) -> int:
+        """P, the models of each robot; a plan is judged by their mean."""
+
+    def initial(self, robots: int) -> Belief:
+        """Returns what B robots believe before they have seen anything: theta_meta and a first embedding."""
+
+    def log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Computes log p of a transition of each robot under each candidate, (B, C), and under its belief, (B,)."""
+
+    def infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
+        """Updates the posterior by the newest transition of the robots that ``moved`` (B,)."""
+
+    def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
+        """Takes lines 6 and 7 of Algorithm 2; returns what of the memory still counts then, too."""
+
+    def model_for(self, belief: Belief, memory: Memory) -> Model:
+        """Returns the dynamics that a belief stands for, B * P of them."""
+
+
 @dataclass(frozen=True)
-class OnlineLoop:
-    """One step of Algorithm 2.
+class Controller:
+    """Runs Algorithm 2.
 
     Attributes:
-        prior: What B robots believe before they have seen anything.
-        log_likelihood: Log-likelihood of a transition of each robot under each candidate, (B, C), and under what it
-            believes, (B,).
-        infer: The belief with its posterior brought up to date after each transition, for the robots that had one.
-        adapt: The belief with the model brought up to date (lines 6 and 7), and what of the memory still counts then.
-        simulator: The model that a belief stands for, given what the robots have seen.
+        adapter: Says what robots believe.
+        planner: MPC.
         reward_fn: r(s, a, s') with actions in [-1, 1].
-        planner: MPC (line 8).
-        members: P, the models of the simulator for each robot; a plan is judged by their mean.
         adapt_every: K; 0 never adapts while an episode lasts.
         adapt_at_reset: Whether to adapt when an episode ends.
         forget_at_reset: Whether a new episode empties a robot's memory.
     """
 
-    prior: Callable[[int], Belief]
-    log_likelihood: Callable[[Belief, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-    infer: Callable[[Memory, Belief, Tensor], Belief]
-    adapt: Callable[[Memory, Belief], tuple[Memory, Belief]]
-    simulator: Callable[[Belief, Memory], Model]
-    reward_fn: RewardFn
+    adapter: Adapter
     planner: Planner
-    members: int
+    reward_fn: RewardFn
     adapt_every: int
-    adapt_at_reset: bool
-    forget_at_reset: bool
+    adapt_at_reset: bool = False
+    forget_at_reset: bool = False
 
-    def begin(self, memory: Memory) -> OnlineState:
-        """The state of B robots with an empty memory."""
+    def init(self, memory: Memory) -> OnlineState:
+        """Returns the state of B robots with an empty memory (line 1)."""
         robots, _, action_dim = memory.action.shape
         plan = torch.zeros(robots, self.planner.horizon, action_dim, device=memory.action.device)
-        return OnlineState(memory, self.prior(robots), plan)
+        return OnlineState(memory, self.adapter.initial(robots), plan)
 
-    def remember(self, state: OnlineState, obs: Tensor, starts: Tensor) -> OnlineState:
-        """Inserts the transition that ends here (lines 9 and 10), and adapts every K.
+    def observe(self, state: OnlineState, obs: Tensor, starts: Tensor) -> OnlineState:
+        """Adds the transition that ends here to the memory (lines 9 and 10), and adapts every K (lines 4 to 7).
 
         Args:
             state: The state after the last action.
@@ -118,17 +133,16 @@ class OnlineLoop:
         """
         if state.last is None:
             return state
-        log_p = self.log_likelihood(state.belief, *state.last, obs)
-        memory = state.memory.add(*state.last, obs, *log_p, valid=~starts)
+        log_p = self.adapter.log_likelihood(state.belief, *state.last, obs)
+        memory, belief = state.memory.add(*state.last, obs, *log_p, valid=~starts), state.belief
         if starts.all():
             return replace(state, last=None)
-        adapts = self.adapt_every or self.adapt_at_reset
-        belief = self.infer(memory, state.belief, ~starts) if adapts else state.belief
-        state = replace(state, memory=memory, belief=belief, last=None, steps=state.steps + 1)
-        if self.adapt_every and state.steps % self.adapt_every == 0:
-            memory, belief = self.adapt(state.memory, state.belief)
-            state = replace(state, memory=memory, belief=belief)
-        return state
+        steps = state.steps + 1
+        if self.adapt_every or self.adapt_at_reset:
+            belief = self.adapter.infer(memory, belief, ~starts)
+        if self.adapt_every and steps % self.adapt_every == 0:
+            memory, belief = self.adapter.adapt(memory, belief)
+        return replace(state, memory=memory, belief=belief, last=None, steps=steps)
 
     @torch.no_grad()
     def act(
@@ -136,9 +150,9 @@ class OnlineLoop:
     ) -> tuple[Tensor, OnlineState]:
         """Plans an action in [-1, 1], (B, action_dim), with the adapted model (line 8)."""
         state = self.reset(state, starts)
-        simulator = self.simulator(state.belief, state.memory)
+        model, members = self.adapter.model_for(state.belief, state.memory), self.adapter.members
         action, plan = self.planner.plan(
-            lambda tau: imagine(simulator, self.reward_fn, obs, tau, self.members), state.plan, generator
+            lambda tau: imagine(model, self.reward_fn, obs, tau, members), state.plan, generator
         )
         return action, replace(state, plan=shift(plan), last=(obs, action))
 
@@ -147,11 +161,11 @@ class OnlineLoop:
         kept = ~starts
         seen = starts & (state.memory.weight.sum(dim=1) > 0)
         if self.adapt_at_reset and seen.any() and state.steps > state.adapted_at:
-            memory, belief = self.adapt(state.memory, state.belief)
+            memory, belief = self.adapter.adapt(state.memory, state.belief)
             memory, belief = memory.where(seen, state.memory), belief.where(seen, state.belief)
             state = replace(state, memory=memory, belief=belief, adapted_at=state.steps)
         if self.forget_at_reset:
             memory = replace(state.memory, weight=state.memory.weight * kept[:, None])
-            prior = replace(self.prior(state.robots), diverged=state.belief.diverged)
+            prior = replace(self.adapter.initial(state.robots), diverged=state.belief.diverged)
             state = replace(state, memory=memory, belief=state.belief.where(kept, prior))
         return replace(state, plan=torch.where(kept[:, None, None], state.plan, 0.0))
