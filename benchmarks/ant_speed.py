@@ -128,7 +128,7 @@ def sgd(repeats: int) -> dict[str, float]:
     joint = JointTraining(steps, 1e-3, 1e-3, SITUATIONS * BATCH)
     generator = torch.Generator().manual_seed(0)
 
-    together, jointly, alone = in_turn(repeats, batched, lambda: joint(model, data, generator), plain)
+    together, jointly, alone = in_turn(repeats, batched, lambda: list(joint.steps(model, data, generator)), plain)
     reptile, shared, theirs = SITUATIONS * steps / together, SITUATIONS * steps / jointly, steps / alone
     return {
         "Reptile (situation-steps / s)": reptile,

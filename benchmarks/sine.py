@@ -157,7 +157,8 @@ def meta_learn(learn: Reptile | MAML, data: Memory, n_situations: int, inner_loo
     start = time.perf_counter()
     # The model's noise stays 1: of a single target, its size does not change which embedding is most likely.
     batch = model.encode(data.obs, data.action, data.next_obs)
-    learn(model, batch, inner_loop, torch.Generator().manual_seed(seed))
+    for _ in learn.steps(model, batch, inner_loop, torch.Generator().manual_seed(seed)):
+        pass
     return Learner(model, inner_loop, time.perf_counter() - start)
 
 

@@ -9,8 +9,8 @@ from famle_agent.adapters import GradientAdapter
 from famle_agent.agent import ModelBasedAgent
 from famle_agent.controller import OnlineState
 from famle_agent.dynamics import Dynamics
-from famle_agent.simulation import Round
-from famle_agent.transitions import Transitions
+from famle_agent.maml import MAML
+from famle_agent.meta_learning import Reptile
 
 __all__ = ["AMPC", "AMPCMAML"]
 
@@ -74,9 +74,8 @@ class AMPC(_OneModelAgent):
     def _method(self, overrides: Mapping[str, Any]) -> str:
         return "ampc"
 
-    def _learn_model(self, transitions: Transitions, round_: Round) -> None:
-        """A network with random weights."""
-        self._begin_model(transitions, new=round_.number == 0)
+    def _meta_learner(self) -> None:
+        """Returns nothing: the network keeps its random weights."""
 
 
 class AMPCMAML(_OneModelAgent):
@@ -98,8 +97,7 @@ class AMPCMAML(_OneModelAgent):
     def _method(self, overrides: Mapping[str, Any]) -> str:
         return str(overrides.get("meta_learner", "reptile"))
 
-    def _learn_model(self, transitions: Transitions, round_: Round) -> None:
-        """Joint training in each round, and in the last one Reptile or MAML."""
+    def _meta_learner(self) -> Reptile | MAML:
+        """Returns Reptile or MAML."""
         settings = self.hyperparameters
-        learn = settings.reptile() if settings.meta_learner == "reptile" else settings.maml()
-        self._meta_train(transitions, round_, learn)
+        return settings.reptile() if settings.meta_learner == "reptile" else settings.maml()

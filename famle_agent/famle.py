@@ -11,8 +11,7 @@ from famle_agent.agent import ModelBasedAgent
 from famle_agent.controller import OnlineState
 from famle_agent.dashboard import log_embeddings
 from famle_agent.dynamics import Dynamics
-from famle_agent.simulation import Round
-from famle_agent.transitions import Transitions
+from famle_agent.meta_learning import Reptile
 
 __all__ = ["FAMLE"]
 
@@ -39,11 +38,12 @@ class FAMLE(ModelBasedAgent):
             raise ValueError("FAMLE meta-learns with Reptile; a meta_learner is for AMPCMAML, which has no embeddings.")
         return ""
 
-    def _learn_model(self, transitions: Transitions, round_: Round) -> None:
-        """Joint training in each round, and in the last one Algorithm 1: Reptile on theta and H."""
-        model = self._meta_train(transitions, round_, self.hyperparameters.reptile())
-        if round_.last:
-            log_embeddings(self.logger, model.embeddings[0], self.situations, self.num_timesteps)
+    def _meta_learner(self) -> Reptile:
+        """Returns Algorithm 1: Reptile on theta and H."""
+        return self.hyperparameters.reptile()
+
+    def _log_model(self) -> None:
+        log_embeddings(self.logger, self._require_dynamics().embeddings[0], self.situations, self.num_timesteps)
 
     def _new_adapter(self, model: Dynamics) -> EmbeddingAdapter:
         return EmbeddingAdapter(model, self.hyperparameters, self.seed or 0)

@@ -15,6 +15,7 @@ from famle_agent.joint_training import JointTraining
 from famle_agent.maml import MAML
 from famle_agent.meta_learning import Reptile
 from famle_agent.planning import ICEM, MPPI, Planner, RandomShooting
+from famle_agent.trainer import MetaTrainer
 
 __all__ = ["Hyperparameters"]
 
@@ -230,6 +231,12 @@ class Hyperparameters:
         """What comes before Algorithm 1, in each round."""
         iterations = self.round_iterations if round_ else self.joint_iterations
         return JointTraining(iterations, self.joint_lr, self.joint_embedding_lr, self.joint_batch_size)
+
+    def trainer(self, round_: int, meta_learner: Reptile | MAML | None) -> MetaTrainer:
+        """Builds what learns in a round; no iterations of the meta-learner leave it at the joint training."""
+        return MetaTrainer(
+            self.joint_training(round_), meta_learner if self.meta_iterations else None, self.inner_loop()
+        )
 
     def inner_loop(self) -> InnerLoop:
         """U^k of meta-learning."""

@@ -7,7 +7,7 @@ explain how they differ.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -35,25 +35,19 @@ class JointTraining:
     batch_size: int
 
     @torch.enable_grad()
-    def __call__(
-        self,
-        model: Dynamics,
-        data: Batch,
-        generator: torch.Generator,
-        callback: Callable[[float], bool] = lambda _: True,
-        progress: Progress | None = None,
-    ) -> bool:
-        """Trains ``model`` in place, from where it is.
+    def steps(
+        self, model: Dynamics, data: Batch, generator: torch.Generator, progress: Progress | None = None
+    ) -> Iterator[float]:
+        """Trains ``model`` in place, from where it is; whoever has enough, stops.
 
         Args:
             model: Its theta and embeddings are trained.
             data: Encoded transitions of the N situations.
             generator: Source of all the chance; the members of the ensemble see different minibatches.
-            callback: Called after each step with the mean loss; returning False ends the training.
             progress: Where a training that was stopped goes on from; None begins anew.
 
-        Returns:
-            Whether all steps were done.
+        Yields:
+            The mean loss of each step.
         """
         groups = [
             {"params": list(model.theta.values()), "lr": self.lr},
@@ -74,9 +68,7 @@ class JointTraining:
             loss.sum().backward()  # type: ignore[no-untyped-call]
             optimizer.step()
             schedule.step()
-            if not callback(loss.detach().mean().item()):
-                return False
-        return True
+            yield loss.detach().mean().item()
 
     def _sample(self, data: Batch, members: int, generator: torch.Generator) -> tuple[torch.Tensor, Batch]:
         """A minibatch for each member, and the situations c (P, batch_size) that its transitions are from."""

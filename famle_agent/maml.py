@@ -7,7 +7,7 @@ has to come from the k gradient steps.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -44,16 +44,15 @@ class MAML:
     max_grad_norm: float = 1.0
 
     @torch.enable_grad()
-    def __call__(
+    def steps(
         self,
         model: Dynamics,
         data: Batch,
         inner_loop: InnerLoop,
         generator: torch.Generator,
-        callback: Callable[[MetaStep], bool] = lambda _: True,
         progress: Progress | None = None,
-    ) -> None:
-        """Runs MAML on ``model`` in place.
+    ) -> Iterator[MetaStep]:
+        """Runs MAML on ``model`` in place, an iteration a step; whoever has enough, stops.
 
         Args:
             model: Randomly initialised model of one embedding, which stays as it is; its theta becomes the
@@ -61,9 +60,10 @@ class MAML:
             data: Encoded transitions of N situations.
             inner_loop: U^k, by stochastic gradient descent on theta alone.
             generator: Source of all the chance.
-            callback: Called after each iteration with the mean loss on the inner steps' own data before them, and on
-                the other data after them; returning False ends meta-learning.
             progress: Where meta-learning that was stopped goes on from; None begins anew.
+
+        Yields:
+            The mean loss on the inner steps' own data before them, and on the other data after them.
 
         Raises:
             ValueError: The model, the data or the update rule do not fit, or the parameters diverge.
@@ -95,8 +95,7 @@ class MAML:
             step = MetaStep(iteration + 1, c, loss_before.mean().item(), loss_after.item())
             if not math.isfinite(step.loss_after):
                 raise ValueError(f"MAML diverged in iteration {step.iteration}; take a smaller inner_lr or meta_lr.")
-            if not callback(step):
-                return
+            yield step
 
     def _adapt(
         self, model: Dynamics, theta: Theta, h: Tensor, support: Batch, inner_loop: InnerLoop

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -52,16 +52,15 @@ class Reptile:
     batch_size: int
 
     @torch.no_grad()
-    def __call__(
+    def steps(
         self,
         model: Dynamics,
         data: Batch,
         inner_loop: InnerLoop,
         generator: torch.Generator,
-        callback: Callable[[MetaStep], bool] = lambda _: True,
         progress: Progress | None = None,
-    ) -> None:
-        """Runs Algorithm 1 on ``model`` in place.
+    ) -> Iterator[MetaStep]:
+        """Runs lines 8 to 14 of Algorithm 1 on ``model`` in place, an iteration a step; whoever has enough, stops.
 
         Args:
             model: Randomly initialised model; its theta and embeddings become the meta-trained ones. With a single
@@ -69,8 +68,10 @@ class Reptile:
             data: Encoded transitions of the N situations.
             inner_loop: U^k.
             generator: Source of all the chance.
-            callback: Called after each iteration; returning False ends meta-learning.
             progress: Where meta-learning that was stopped goes on from; None begins anew.
+
+        Yields:
+            What each iteration did.
 
         Raises:
             ValueError: There are not as many situations in the data as embeddings in the model.
@@ -100,9 +101,7 @@ class Reptile:
                 h = h.lerp(h_tilde, decay * self.embedding_meta_lr)
                 model.embeddings[:, c] = h.view(-1, members, h.shape[1]).transpose(0, 1)
 
-            step = MetaStep(iteration + 1, c, losses[0].mean().item(), losses[-1].mean().item())
-            if not callback(step):
-                return
+            yield MetaStep(iteration + 1, c, losses[0].mean().item(), losses[-1].mean().item())
 
     def _sample(self, data: Batch, c: Tensor, generator: torch.Generator) -> Batch:
         """A minibatch of each situation in ``c``, with repetitions."""

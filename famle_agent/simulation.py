@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,65 +24,27 @@ from famle_agent.algorithm import ModelBasedAlgorithm
 from famle_agent.dynamics import Batch, Dynamics
 from famle_agent.envs import EnvLike, SituationEnvs, situation_envs
 from famle_agent.maml import MAML
-from famle_agent.meta_learning import MetaStep, Reptile
+from famle_agent.meta_learning import Reptile
 from famle_agent.policies import MakePolicy, make_held_uniform, make_planning, reward_names
 from famle_agent.progress import Progress
 from famle_agent.run_folder import RunFolder
+from famle_agent.trainer import Metrics
 from famle_agent.transitions import Transitions, collect
 from famle_agent.units import ActionScale
 
-__all__ = ["Round", "SimulationLearner"]
-
-
-@dataclass(frozen=True)
-class Round:
-    """Learning from what has been simulated so far.
-
-    Attributes:
-        number: 0 begins with a new model, the others go on with the last one.
-        last: Whether Algorithm 1 comes after it.
-        on_iteration: Takes scalars to log, and says whether to go on.
-        progress: Where a stage of the learning, given its name, goes on from.
-    """
-
-    number: int
-    last: bool
-    on_iteration: Callable[[dict[str, float]], bool]
-    progress: Callable[[str], Progress]
-
-
-@dataclass(frozen=True)
-class _Call:
-    """What all rounds of one call of :meth:`SimulationLearner.meta_learn` have in common.
-
-    Attributes:
-        rounds: The number of the last one.
-        folder: Where it can go on from.
-        n_jobs: Processes that simulate.
-        progress_bar: Whether to show progress bars.
-    """
-
-    rounds: int
-    folder: RunFolder
-    n_jobs: int
-    progress_bar: bool
-
-    def bar(self, name: str, number: int, total: int, unit: str) -> tqdm[Any]:
-        """The progress bar of a round."""
-        desc = f"{name} {number + 1}/{self.rounds + 1}" if self.rounds else name
-        return tqdm(total=total, desc=desc, unit=unit, mininterval=1.0, disable=not self.progress_bar)
+__all__ = ["SimulationLearner"]
 
 
 class SimulationLearner(ModelBasedAlgorithm):
     """The part of an agent that learns its model in simulation.
 
-    Subclasses say how the model is learnt (:meth:`_learn_model`). Arguments as for
+    Subclasses say how it is meta-learned (:meth:`_meta_learner`). Arguments as for
     :class:`~famle_agent.algorithm.ModelBasedAlgorithm`.
     """
 
     @abstractmethod
-    def _learn_model(self, transitions: Transitions, round_: Round) -> None:
-        """Learns :attr:`dynamics` from simulated transitions (actions in [-1, 1])."""
+    def _meta_learner(self) -> Reptile | MAML | None:
+        """Returns what comes after training on all situations at once."""
 
     @abstractmethod
     def forget(self) -> None:
@@ -89,6 +53,9 @@ class SimulationLearner(ModelBasedAlgorithm):
     @abstractmethod
     def _restore(self, file: Path) -> None:
         """Takes over the model of a stored agent, and where its random numbers had got to."""
+
+    def _log_model(self) -> None:
+        """Shows the learnt model where there is something to show."""
 
     def meta_learn(
         self,
@@ -139,7 +106,11 @@ class SimulationLearner(ModelBasedAlgorithm):
         hooks.on_training_start(locals(), globals())
         known = self.situations, self.dynamics, self._learned_reward
         try:
-            self._go_round(source, _Call(rounds, run, n_jobs, progress_bar), hooks)
+            with closing(self._train(source, rounds, run, n_jobs, progress_bar)) as training:
+                for metrics in training:
+                    if not self._log_iteration(metrics, max(1, total_timesteps // 200), hooks):
+                        break
+            self._log_model()
         except BaseException:
             self.situations, self.dynamics, self._learned_reward = known  # half-learnt models are none
             self.num_timesteps = 0
@@ -148,81 +119,81 @@ class SimulationLearner(ModelBasedAlgorithm):
         self.num_timesteps = 0
         return self
 
-    def _go_round(self, source: SituationEnvs | Transitions, call: _Call, hooks: BaseCallback) -> None:
-        """Simulates and learns, round by round, until a callback ends it."""
-        transitions = None
-        for number in range(call.rounds + 1):
-            new = self._in_model_units(
-                source if isinstance(source, Transitions) else self._simulate(source, number, call)
-            )
+    def _train(
+        self, source: SituationEnvs | Transitions, rounds: int, folder: RunFolder, n_jobs: int, progress_bar: bool
+    ) -> Generator[Metrics]:
+        """Runs Algorithm 1 round by round: simulates, and learns from all that has been simulated so far."""
+        settings, transitions = self.hyperparameters, None
+
+        def bar(name: str, number: int, total: int, unit: str) -> tqdm[Any]:
+            desc = f"{name} {number + 1}/{rounds + 1}" if rounds else name
+            return tqdm(total=total, desc=desc, unit=unit, mininterval=1.0, disable=not progress_bar)
+
+        for number in range(rounds + 1):
+            last = number == rounds
+            # Lines 1 to 6: transitions D_c of every situation c.
+            if isinstance(source, Transitions):
+                new = source
+            else:
+                n = (settings.round_transitions if number else settings.transitions_per_situation) * len(source.sources)
+                with bar("Simulating", number, n, "step") as simulating:
+                    new = self._simulate(source, number, n_jobs, folder.transitions(number), simulating.update)
+            new = self._in_model_units(new)
             transitions = new if transitions is None else transitions.followed_by(new)
-            if (agent := call.folder.finished(number)) is not None:
+            if (agent := folder.finished(number)) is not None:
                 self._restore(agent)
-                self.num_timesteps = self.hyperparameters.iterations(number, last=number == call.rounds)
+                self.num_timesteps = settings.iterations(number, last)
                 continue
-            if not self._learn_round(transitions, number, call, hooks):
-                break
-            call.folder.finish(number, self.save)
 
-    def _learn_round(self, transitions: Transitions, number: int, call: _Call, hooks: BaseCallback) -> bool:
-        """Learns the model, and the reward where it is not known; says whether no callback ended it."""
-        settings, last, going_on = self.hyperparameters, number == call.rounds, True
-        log_interval = max(1, settings.iterations(call.rounds) // 200)
-        left = settings.iterations(number, last) - self.num_timesteps
-        with call.bar("Meta-learning", number, left, "it") as bar:
-
-            def on_iteration(scalars: dict[str, float]) -> bool:
-                nonlocal going_on
-                bar.set_postfix({key.split("/")[-1]: f"{value:.3g}" for key, value in scalars.items()}, refresh=False)
-                bar.update()
-                going_on = self._log_iteration(scalars, log_interval, hooks)
-                return going_on
-
-            def skipped(iterations: int) -> None:
-                self.num_timesteps += iterations
-                bar.update(iterations)
-
-            def progress(stage: str) -> Progress:
-                return Progress(call.folder.progress(number, stage), skipped)
-
-            with torch.random.fork_rng(devices=[]):
+            # Lines 7 to 14: theta and H from them.
+            left = settings.iterations(number, last) - self.num_timesteps
+            with bar("Meta-learning", number, left, "it") as learning, torch.random.fork_rng(devices=[]):
                 torch.manual_seed(self._draw_seed())  # initial weights come from torch's global generator
                 self.situations = transitions.situations
                 self._learn_reward(transitions)  # first, so that callbacks can let the agent act
-                self._learn_model(transitions, Round(number, last, on_iteration, progress))
-        return going_on
+                model, data = self._begin_model(transitions, number == 0 or (last and settings.restart_last_round))
+                progress = partial(self._progress, folder, number, learning)
+                trainer = settings.trainer(number, self._meta_learner() if last else None)
+                for metrics in trainer.fit(model, data, self._generator, progress):
+                    shown = {key.split("/")[-1]: f"{value:.3g}" for key, value in metrics.items()}
+                    learning.set_postfix(shown, refresh=False)
+                    learning.update()
+                    yield metrics
+            folder.finish(number, self.save)
+
+    def _progress(self, folder: RunFolder, number: int, bar: tqdm[Any], stage: str) -> Progress:
+        """Returns where a stage of a round goes on from, and counts what had been done of it before."""
+
+        def skipped(iterations: int) -> None:
+            self.num_timesteps += iterations
+            bar.update(iterations)
+
+        return Progress(folder.progress(number, stage), skipped)
 
     def collect(
         self, envs: Sequence[EnvLike] | None = None, progress_bar: bool = False, n_jobs: int = 1
     ) -> Transitions:
         """Collects the random transitions that :meth:`meta_learn` learns from; arguments as there."""
-        call = _Call(self.hyperparameters.rounds, RunFolder(None, {}), n_jobs, progress_bar)
-        return self._simulate(self._situation_envs(envs), 0, call)
+        source = self._situation_envs(envs)
+        n = self.hyperparameters.transitions_per_situation * len(source.sources)
+        with tqdm(total=n, desc="Simulating", unit="step", mininterval=1.0, disable=not progress_bar) as bar:
+            return self._simulate(source, 0, n_jobs, None, bar.update)
 
     def _situation_envs(self, envs: Sequence[EnvLike] | None) -> SituationEnvs:
         return situation_envs(self._require_env(), envs, self.hyperparameters.episode_length)
 
-    def _simulate(self, envs: SituationEnvs, number: int, call: _Call) -> Transitions:
-        """Random transitions in round 0, the agent's own planning after that."""
+    def _simulate(
+        self, envs: SituationEnvs, number: int, n_jobs: int, folder: Path | None, callback: Callable[[int], object]
+    ) -> Transitions:
+        """Collects random transitions in round 0, and the agent's own planning after that."""
         settings = self.hyperparameters
         make_policy: MakePolicy
         if number == 0:
             n, make_policy = settings.transitions_per_situation, make_held_uniform(settings.action_hold)
         else:
             n, make_policy = settings.round_transitions, self._planning()
-        seed, folder = self._draw_seed(), call.folder.transitions(number)
-        with call.bar("Simulating", number, n * len(envs.sources), "step") as bar:
-            return collect(
-                envs.sources,
-                envs.situations,
-                n,
-                make_policy,
-                seed,
-                bar.update,
-                call.n_jobs,
-                folder,
-                settings.episode_length,
-            )
+        seed, length = self._draw_seed(), settings.episode_length
+        return collect(envs.sources, envs.situations, n, make_policy, seed, callback, n_jobs, folder, length)
 
     def _planning(self) -> MakePolicy:
         """What makes the agent plan with what it has learnt so far."""
@@ -288,23 +259,3 @@ class SimulationLearner(ModelBasedAlgorithm):
             self.dynamics.fit_normalisation(obs, action, next_obs)
         model = self._require_dynamics()
         return model, model.encode(obs, action, next_obs)
-
-    def _meta_train(self, transitions: Transitions, round_: Round, learn: Reptile | MAML) -> Dynamics:
-        """Trains the model on all situations at once, and in the last round meta-learns from there."""
-        settings = self.hyperparameters
-        model, data = self._begin_model(
-            transitions, round_.number == 0 or (round_.last and settings.restart_last_round)
-        )
-
-        def log_joint(loss: float) -> bool:
-            return round_.on_iteration({"meta/joint_loss": loss})
-
-        def log_meta(step: MetaStep) -> bool:
-            return round_.on_iteration({"meta/loss_before": step.loss_before, "meta/loss_after": step.loss_after})
-
-        joint_training = settings.joint_training(round_.number)
-        finished = joint_training(model, data, self._generator, log_joint, round_.progress("joint"))
-        if round_.last and settings.meta_iterations and finished:
-            learn(model, data, settings.inner_loop(), self._generator, log_meta, round_.progress("meta"))
-        model.fit_noise(data)
-        return model

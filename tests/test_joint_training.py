@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import islice
+
 import pytest
 import torch
 
@@ -24,7 +26,7 @@ def fresh_model(members: int = 1, gate_actions: bool = True) -> Dynamics:
 
 def trained(training: JointTraining = TRAINING, seed: int = 0, members: int = 1, gate: bool = True) -> Dynamics:
     model = fresh_model(members, gate)
-    assert training(model, situations(), torch.Generator().manual_seed(seed))
+    list(training.steps(model, situations(), torch.Generator().manual_seed(seed)))
     return model
 
 
@@ -45,29 +47,24 @@ def test_situations_that_differ_by_their_embedding_alone_are_told_apart(gate: bo
         assert (losses(model, others) > 3 * own).all()
 
 
-def test_callback_sees_the_loss_fall() -> None:
-    seen: list[float] = []
-    assert TRAINING(fresh_model(), situations(), torch.Generator().manual_seed(0), lambda x: seen.append(x) or True)
+def test_loss_falls() -> None:
+    seen = list(TRAINING.steps(fresh_model(), situations(), torch.Generator().manual_seed(0)))
     assert len(seen) == 400
     assert sum(seen[-20:]) < 0.1 * sum(seen[:20])
 
 
-def test_callback_ends_it() -> None:
-    model, before, seen = fresh_model(), fresh_model(), list[float]()
-
-    def callback(loss: float) -> bool:
-        seen.append(loss)
-        return len(seen) < 3
-
-    assert TRAINING(model, situations(), torch.Generator().manual_seed(0), callback) is False
-    assert len(seen) == 3
+def test_whoever_has_enough_stops() -> None:
+    model, before = fresh_model(), fresh_model()
+    training = TRAINING.steps(model, situations(), torch.Generator().manual_seed(0))
+    assert len(list(islice(training, 3))) == 3
+    training.close()  # type: ignore[attr-defined]
     assert not torch.equal(model.embeddings, before.embeddings)
 
 
 def test_no_iterations_change_nothing() -> None:
     model, before = fresh_model(), fresh_model()
     none = JointTraining(iterations=0, lr=0.1, embedding_lr=0.1, batch_size=8)
-    assert none(model, situations(), torch.Generator(), lambda _: False) is True
+    assert list(none.steps(model, situations(), torch.Generator())) == []
     for name, value in model.state_dict().items():
         assert torch.equal(value, before.state_dict()[name])
 
@@ -83,7 +80,7 @@ def test_same_seed_same_model() -> None:
 def test_all_chance_comes_from_the_generator() -> None:
     model, state = fresh_model(), torch.get_rng_state()
     few = JointTraining(iterations=2, lr=0.01, embedding_lr=0.03, batch_size=8)
-    few(model, situations(), torch.Generator().manual_seed(0))
+    list(few.steps(model, situations(), torch.Generator().manual_seed(0)))
     assert torch.equal(torch.get_rng_state(), state)
 
 
@@ -100,12 +97,8 @@ def test_steps_become_smaller_in_the_second_half() -> None:
     """Of a loss that falls for ever, Adam's steps are as long as its rate says."""
     training, model = JointTraining(iterations=20, lr=0.0, embedding_lr=0.01, batch_size=400), fresh_model()
     places = [model.embeddings.detach().clone()]
-
-    def callback(_: float) -> bool:
+    for _ in training.steps(model, situations(), torch.Generator().manual_seed(0)):
         places.append(model.embeddings.detach().clone())
-        return True
-
-    training(model, situations(), torch.Generator().manual_seed(0), callback)
     lengths = torch.stack(places).diff(dim=0).abs().amax(dim=(1, 2, 3))
     torch.testing.assert_close(lengths[:3], torch.full((3,), 0.01), rtol=0.2, atol=0.0)
     assert lengths[-1] < 0.25 * lengths[0]
@@ -127,6 +120,6 @@ def test_members_that_begin_alike_part_ways() -> None:
     with torch.no_grad():
         for value in (*model.theta.values(), model.embeddings):
             value[1] = value[0]
-    TRAINING(model, situations(), torch.Generator().manual_seed(0), lambda _: False)
+    next(iter(TRAINING.steps(model, situations(), torch.Generator().manual_seed(0))))
     assert not torch.equal(model.embeddings[0], model.embeddings[1])
     assert not torch.equal(model.theta["weight_0"][0], model.theta["weight_0"][1])

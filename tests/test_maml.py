@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import islice
 
 import pytest
 import torch
@@ -8,7 +9,6 @@ import torch
 from famle_agent.dynamics import Batch, Dynamics, Theta, expand
 from famle_agent.inner_loop import InnerLoop
 from famle_agent.maml import MAML
-from famle_agent.meta_learning import MetaStep
 
 INNER_LOOP = InnerLoop(steps=2, lr=0.1, embedding_lr=0.0)
 SETTINGS = MAML(iterations=100, meta_lr=0.03, meta_batch_size=10, batch_size=5, query_size=10)
@@ -29,7 +29,7 @@ def fresh_model(n_situations: int = 1, members: int = 1) -> Dynamics:
 
 def meta_learn(maml: MAML, seed: int = 0) -> Dynamics:
     model = fresh_model()
-    maml(model, situations(40, seed=1), INNER_LOOP, torch.Generator().manual_seed(seed))
+    list(maml.steps(model, situations(40, seed=1), INNER_LOOP, torch.Generator().manual_seed(seed)))
     return model
 
 
@@ -102,15 +102,11 @@ def test_inner_steps_and_their_judgement_see_different_transitions_of_the_same_s
         assert sorted(seen.tolist()) == serial[situation].flatten().tolist()
 
 
-def test_embedding_stays_and_the_callback_ends_it() -> None:
-    model, steps = fresh_model(), []
+def test_embedding_stays_and_whoever_has_enough_stops() -> None:
+    model = fresh_model()
     before = model.embeddings.detach().clone()
-
-    def callback(step: MetaStep) -> bool:
-        steps.append(step)
-        return step.iteration < 3
-
-    SETTINGS(model, situations(4, seed=1), INNER_LOOP, torch.Generator().manual_seed(0), callback)
+    learning = SETTINGS.steps(model, situations(4, seed=1), INNER_LOOP, torch.Generator().manual_seed(0))
+    steps = list(islice(learning, 3))
     assert [step.iteration for step in steps] == [1, 2, 3]
     assert all(len(step.situations) == 4 for step in steps)  # fewer situations than the meta-batch asks for
     assert torch.equal(model.embeddings, before)
@@ -128,7 +124,7 @@ def test_embedding_stays_and_the_callback_ends_it() -> None:
 )
 def test_misuse_says_what_to_do(inner_loop: InnerLoop, n_situations: int, maml: MAML, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        maml(fresh_model(n_situations), situations(4, seed=1), inner_loop, torch.Generator())
+        next(maml.steps(fresh_model(n_situations), situations(4, seed=1), inner_loop, torch.Generator()))
 
 
 # --- ensembles ----------------------------------------------------------------------------------------------
@@ -142,7 +138,7 @@ def test_each_member_descends_the_gradient_that_it_would_have_alone(first_order:
     still = replace(SETTINGS, iterations=1, meta_lr=0.0, max_grad_norm=1e9, first_order=first_order)
     ensemble = fresh_model(members=3).double()
     for model in (ensemble, *(alone := [ensemble.with_members(1, member) for member in range(3)])):
-        still(model, data, INNER_LOOP, torch.Generator())
+        list(still.steps(model, data, INNER_LOOP, torch.Generator()))
     for member in range(3):
         for name, value in ensemble.theta.items():
             torch.testing.assert_close(value.grad[member], alone[member].theta[name].grad[0])
@@ -156,7 +152,7 @@ def test_members_learn_as_independent_networks_do() -> None:
         for value in ensembles[1].theta.values():
             value[1].mul_(3.0)
     for model in ensembles:
-        few(model, data, INNER_LOOP, torch.Generator().manual_seed(0))
+        list(few.steps(model, data, INNER_LOOP, torch.Generator().manual_seed(0)))
     for name, value in ensembles[0].theta.items():
         torch.testing.assert_close(value[[0, 2]], ensembles[1].theta[name][[0, 2]])
         assert not torch.allclose(value[1], ensembles[1].theta[name][1])
@@ -165,7 +161,7 @@ def test_members_learn_as_independent_networks_do() -> None:
 def test_members_of_an_ensemble_are_as_good_as_one_network() -> None:
     """As many networks, from as many starting points and of as many minibatches."""
     before, model, data = fresh_model(members=3), fresh_model(members=3), situations(40, seed=1)
-    SETTINGS(model, data, INNER_LOOP, torch.Generator().manual_seed(0))
+    list(SETTINGS.steps(model, data, INNER_LOOP, torch.Generator().manual_seed(0)))
     alone = loss_after_adaptation(meta_learn(SETTINGS), seed=2)
     for member in range(3):
         after, start = (loss_after_adaptation(one.with_members(1, member), seed=2) for one in (model, before))
@@ -193,4 +189,4 @@ def test_gradient_of_each_member_is_shortened_by_itself() -> None:
 def test_divergence_says_what_to_do(first_order: bool, members: int) -> None:
     wild, maml = replace(INNER_LOOP, lr=1e6, steps=5), replace(SETTINGS, first_order=first_order)
     with pytest.raises(ValueError, match=r"diverged in iteration \d+; take a smaller inner_lr or meta_lr"):
-        maml(fresh_model(members=members), situations(4, seed=1), wild, torch.Generator().manual_seed(0))
+        list(maml.steps(fresh_model(members=members), situations(4, seed=1), wild, torch.Generator().manual_seed(0)))

@@ -30,9 +30,8 @@ def situations() -> Batch:
 
 
 def meta_learn(reptile: Reptile, seed: int = 0, members: int = 1) -> tuple[Dynamics, list[MetaStep]]:
-    model, steps = fresh_model(members), []
-    reptile(model, situations(), INNER_LOOP, torch.Generator().manual_seed(seed), lambda s: steps.append(s) or True)
-    return model, steps
+    model = fresh_model(members)
+    return model, list(reptile.steps(model, situations(), INNER_LOOP, torch.Generator().manual_seed(seed)))
 
 
 @pytest.mark.parametrize("members", [1, 3])
@@ -41,8 +40,7 @@ def test_one_iteration_is_algorithm_1(meta_batch_size: int, members: int) -> Non
     """theta += alpha_meta (theta~ - theta), h_c += beta_meta (h~ - h_c), and the other embeddings stay."""
     model, before, data = fresh_model(members), fresh_model(members), situations()
     reptile = Reptile(iterations=1, meta_lr=0.3, embedding_meta_lr=0.7, meta_batch_size=meta_batch_size, batch_size=8)
-    steps: list[MetaStep] = []
-    reptile(model, data, INNER_LOOP, torch.Generator().manual_seed(5), lambda s: steps.append(s) or True)
+    steps = list(reptile.steps(model, data, INNER_LOOP, torch.Generator().manual_seed(5)))
     c = steps[0].situations
 
     generator = torch.Generator().manual_seed(5)
@@ -96,14 +94,9 @@ def test_meta_batch_may_be_larger_than_the_situations() -> None:
 def test_steps_become_smaller() -> None:
     """The meta-rates decay linearly: the last of n iterations takes 1 / n of the first one's step."""
     reptile = Reptile(iterations=10, meta_lr=1.0, embedding_meta_lr=1.0, meta_batch_size=4, batch_size=60)
-    model, embeddings = fresh_model(), []
-
-    def callback(step: MetaStep) -> bool:
-        embeddings.append(model.embeddings.detach().clone())
-        return True
-
-    no_learning = InnerLoop(steps=1, lr=0.0, embedding_lr=1.0)
-    reptile(model, situations(), no_learning, torch.Generator().manual_seed(0), callback)
+    model, no_learning = fresh_model(), InnerLoop(steps=1, lr=0.0, embedding_lr=1.0)
+    learning = reptile.steps(model, situations(), no_learning, torch.Generator().manual_seed(0))
+    embeddings = [model.embeddings.detach().clone() for _ in learning]
     first, last = (embeddings[0] - fresh_model().embeddings).norm(), (embeddings[-1] - embeddings[-2]).norm()
     assert last < 0.2 * first
 
@@ -133,18 +126,16 @@ def test_data_of_another_number_of_situations_are_refused() -> None:
     reptile = Reptile(iterations=1, meta_lr=1.0, embedding_meta_lr=1.0, meta_batch_size=4, batch_size=16)
     model = Dynamics(1, 1, n_situations=3, embedding_dim=2, members=4)
     with pytest.raises(ValueError, match="3 embeddings, the data 4 situations"):
-        reptile(model, situations(), INNER_LOOP, torch.Generator())
+        next(reptile.steps(model, situations(), INNER_LOOP, torch.Generator()))
 
 
-def test_callback_ends_it() -> None:
+def test_whoever_has_enough_stops() -> None:
     model, steps = fresh_model(), []
-
-    def callback(step: MetaStep) -> bool:
-        steps.append(step.iteration)
-        return step.iteration < 3
-
     reptile = Reptile(iterations=50, meta_lr=0.5, embedding_meta_lr=0.5, meta_batch_size=2, batch_size=8)
-    reptile(model, situations(), INNER_LOOP, torch.Generator().manual_seed(0), callback)
+    for step in reptile.steps(model, situations(), INNER_LOOP, torch.Generator().manual_seed(0)):
+        steps.append(step.iteration)
+        if step.iteration == 3:
+            break
     assert steps == [1, 2, 3]
 
 
@@ -156,16 +147,18 @@ THETA_ALONE = InnerLoop(steps=4, lr=0.05, embedding_lr=0.0)
 
 def follow_reptile(model: Dynamics, data: Batch) -> None:
     learn = Reptile(iterations=60, meta_lr=1.0, embedding_meta_lr=1.0, meta_batch_size=2, batch_size=16)
-    learn(model, data, INNER_LOOP, torch.Generator().manual_seed(0))
+    list(learn.steps(model, data, INNER_LOOP, torch.Generator().manual_seed(0)))
 
 
 def follow_maml(model: Dynamics, data: Batch) -> None:
     learn = MAML(iterations=60, meta_lr=0.01, meta_batch_size=2, batch_size=16, query_size=16)
-    learn(model, data, THETA_ALONE, torch.Generator().manual_seed(0))
+    list(learn.steps(model, data, THETA_ALONE, torch.Generator().manual_seed(0)))
 
 
 def train_jointly(model: Dynamics, data: Batch) -> None:
-    JointTraining(60, lr=0.01, embedding_lr=0.0, batch_size=32)(model, data, torch.Generator().manual_seed(0))
+    list(
+        JointTraining(60, lr=0.01, embedding_lr=0.0, batch_size=32).steps(model, data, torch.Generator().manual_seed(0))
+    )
 
 
 every_learner = pytest.mark.parametrize("learn", [follow_reptile, follow_maml, train_jointly])
@@ -197,7 +190,7 @@ def test_reptile_with_one_embedding_moves_towards_the_mean_of_the_adapted_networ
     theta = {name: value.clone() for name, value in theta.items()}
     alike = Batch(data.x[:, :1], data.y[:, :1], data.weight[:, :1])  # there is but one minibatch to draw
     adapted, _, _ = THETA_ALONE(model, expand(theta, 4), h, lambda: alike)
-    Reptile(1, 0.3, 0.7, 4, batch_size=1)(model, alike, THETA_ALONE, torch.Generator())
+    list(Reptile(1, 0.3, 0.7, 4, batch_size=1).steps(model, alike, THETA_ALONE, torch.Generator()))
     for name, value in model.parameters_by_name().items():
         torch.testing.assert_close(value, theta[name] + 0.3 * (adapted[name] - theta[name]).mean(dim=0, keepdim=True))
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -18,7 +17,7 @@ from famle_agent.progress import Progress
 
 N = 6
 SGD = InnerLoop(steps=2, lr=0.05, embedding_lr=0.0)
-Learn = Callable[[Dynamics, torch.Generator, Callable[[Any], bool], Progress], object]
+Learn = Callable[[Dynamics, torch.Generator, Progress], Iterator[object]]
 
 
 def situations() -> Batch:
@@ -28,24 +27,20 @@ def situations() -> Batch:
     return Batch(x, gain * x[..., 1:] + 0.5 * x[..., :1], torch.ones(4, 60))
 
 
-def joint(model: Dynamics, generator: torch.Generator, callback: Callable[[Any], bool], progress: Progress) -> object:
-    return JointTraining(N, 0.01, 0.03, 16)(model, situations(), generator, callback, progress)
+def joint(model: Dynamics, generator: torch.Generator, progress: Progress) -> Iterator[object]:
+    return JointTraining(N, 0.01, 0.03, 16).steps(model, situations(), generator, progress)
 
 
-def reptile(model: Dynamics, generator: torch.Generator, callback: Callable[[Any], bool], progress: Progress) -> object:
-    return Reptile(N, 0.5, 0.5, 2, 8)(model, situations(), InnerLoop(2, 0.05, 0.2), generator, callback, progress)
+def reptile(model: Dynamics, generator: torch.Generator, progress: Progress) -> Iterator[object]:
+    return Reptile(N, 0.5, 0.5, 2, 8).steps(model, situations(), InnerLoop(2, 0.05, 0.2), generator, progress)
 
 
-def maml(model: Dynamics, generator: torch.Generator, callback: Callable[[Any], bool], progress: Progress) -> object:
-    return MAML(N, 0.03, 2, 8, 8)(model, situations(), SGD, generator, callback, progress)
+def maml(model: Dynamics, generator: torch.Generator, progress: Progress) -> Iterator[object]:
+    return MAML(N, 0.03, 2, 8, 8).steps(model, situations(), SGD, generator, progress)
 
 
 LEARNERS: dict[str, tuple[Learn, int]] = {"joint": (joint, 4), "reptile": (reptile, 4), "maml": (maml, 1)}
 """Each with the number of embeddings that it asks for."""
-
-
-class StoppedError(Exception):
-    pass
 
 
 def learnt(name: str, progress: Progress, stop_after: int = N + 1) -> tuple[Dynamics, torch.Generator, int]:
@@ -54,18 +49,10 @@ def learnt(name: str, progress: Progress, stop_after: int = N + 1) -> tuple[Dyna
     torch.manual_seed(0)
     model = Dynamics(1, 1, embeddings, embedding_dim=2, hidden=(8,), members=2)
     generator, done = torch.Generator().manual_seed(3), 0
-
-    def callback(_: Any) -> bool:
-        nonlocal done
+    for _ in learn(model, generator, progress):
+        if done + 1 == stop_after:
+            break  # this iteration has not ended
         done += 1
-        if done == stop_after:
-            raise StoppedError
-        return True
-
-    try:
-        learn(model, generator, callback, progress)
-    except StoppedError:
-        return model, generator, done - 1  # the last one had not ended
     return model, generator, done
 
 

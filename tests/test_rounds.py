@@ -76,13 +76,13 @@ def stored(folder: Path, round_: int) -> list[Transitions]:
 def watch(agent: FAMLE, monkeypatch: pytest.MonkeyPatch) -> list[Transitions]:
     """All transitions that each round learns from."""
     seen: list[Transitions] = []
-    learn = agent._learn_model
+    begin = agent._begin_model
 
-    def learn_model(transitions: Transitions, *args: Any) -> None:
+    def begin_model(transitions: Transitions, new: bool) -> Any:
         seen.append(transitions)
-        learn(transitions, *args)
+        return begin(transitions, new)
 
-    monkeypatch.setattr(agent, "_learn_model", learn_model)
+    monkeypatch.setattr(agent, "_begin_model", begin_model)
     return seen
 
 
@@ -130,14 +130,14 @@ def test_rounds_plan_for_the_reward(make_agent: Make, monkeypatch: pytest.Monkey
 
 def test_model_goes_on_from_round_to_round(make_agent: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     agent, models = make_agent(joint_lr=0.0, joint_embedding_lr=0.0, meta_iterations=0), list[Dynamics]()
-    learn = agent._learn_model
+    learn = agent._begin_model
 
-    def learn_model(*args: Any) -> None:
-        learn(*args)
-        assert agent.dynamics is not None
-        models.append(agent.dynamics)
+    def begin_model(*args: Any) -> Any:
+        model, data = learn(*args)
+        models.append(model)
+        return model, data
 
-    monkeypatch.setattr(agent, "_learn_model", learn_model)
+    monkeypatch.setattr(agent, "_begin_model", begin_model)
     agent.meta_learn(SITUATIONS)
     assert models[0] is models[1] is models[2]
     fresh = make_agent(joint_lr=0.0, joint_embedding_lr=0.0, meta_iterations=0, rounds=0).meta_learn(SITUATIONS)
@@ -148,14 +148,14 @@ def test_model_goes_on_from_round_to_round(make_agent: Make, monkeypatch: pytest
 
 def test_last_round_may_begin_anew(make_agent: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     agent = make_agent(restart_last_round=True, joint_lr=0.0, joint_embedding_lr=0.0, meta_iterations=0)
-    models, learn = list[Dynamics](), agent._learn_model
+    models, learn = list[Dynamics](), agent._begin_model
 
-    def learn_model(*args: Any) -> None:
-        learn(*args)
-        assert agent.dynamics is not None
-        models.append(agent.dynamics)
+    def begin_model(*args: Any) -> Any:
+        model, data = learn(*args)
+        models.append(model)
+        return model, data
 
-    monkeypatch.setattr(agent, "_learn_model", learn_model)
+    monkeypatch.setattr(agent, "_begin_model", begin_model)
     agent.meta_learn(SITUATIONS)
     assert models[0] is models[1] is not models[2]
     assert not torch.equal(models[2].embeddings, models[0].embeddings)
