@@ -30,7 +30,7 @@ from benchmarks.methods import METHODS, PPO_METHODS, Method, about, famle, from_
 from benchmarks.reporting.report import show
 from benchmarks.task import Task
 from famle_agent import FAMLE, FAMLEWrapper, ModelBasedAgent
-from famle_agent.robots import known_robots
+from famle_agent.agents.presets import known_robots
 from famle_agent.rollout import Rollout, rollout
 from famle_envs import Situation
 from famle_envs.ant import AntEnv

@@ -18,9 +18,9 @@ from torch import Tensor
 from benchmarks.methods import from_cache, shipped, simulated_data
 from benchmarks.task import Task
 from famle_agent import FAMLE, Transitions
-from famle_agent.dynamics import Dynamics
-from famle_agent.policies import make_held_uniform
-from famle_agent.transitions import collect
+from famle_agent.data.collect import collect
+from famle_agent.data.policies import make_held_uniform
+from famle_agent.models.dynamics import Dynamics
 
 __all__ = ["informed"]
 

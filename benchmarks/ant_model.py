@@ -23,12 +23,15 @@ from benchmarks.ant import ADAPTS, damage_of
 from benchmarks.harness import provenance, write_json
 from benchmarks.methods import shipped
 from famle_agent import FAMLE, Transitions
-from famle_agent.adaptation import Belief, Candidates, adapt, prior, window_posterior
-from famle_agent.dynamics import Batch, Dynamics
-from famle_agent.inner_loop import InnerLoop
-from famle_agent.memory import Memory
-from famle_agent.policies import make_held_uniform
-from famle_agent.transitions import collect
+from famle_agent.adaptation.belief import Belief, prior
+from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.memory import Memory
+from famle_agent.adaptation.posterior import window_posterior
+from famle_agent.adaptation.update import adapt
+from famle_agent.data.collect import collect
+from famle_agent.data.policies import make_held_uniform
+from famle_agent.models.dynamics import Batch, Dynamics
+from famle_agent.models.gradient_steps import InnerLoop
 from famle_envs import Situation
 
 ROLLOUT = 20  # steps of the long error

@@ -25,10 +25,10 @@ from benchmarks.harness import provenance, write_json
 from benchmarks.methods import shipped
 from benchmarks.speed import in_turn
 from famle_agent import FAMLEWrapper
-from famle_agent.dynamics import Batch, Dynamics, expand
-from famle_agent.inner_loop import InnerLoop
-from famle_agent.joint_training import JointTraining
+from famle_agent.models.dynamics import Batch, Dynamics, expand
+from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.rollout import rollout
+from famle_agent.training.multitask import JointTraining
 
 SITUATIONS, BATCH = 20, 32
 HIDDEN = (200, 200, 100)  # the paper's network

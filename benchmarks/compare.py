@@ -9,7 +9,7 @@ from pathlib import Path
 from benchmarks.harness import Fleet, Options, Replicate, ReplicateError, Result, is_stored, run_replicates
 from benchmarks.methods import METHODS, Method
 from benchmarks.task import Task
-from famle_agent.cluster import parallel
+from famle_agent.utils.parallel import parallel
 
 __all__ = ["compare"]
 

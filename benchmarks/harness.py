@@ -18,8 +18,8 @@ from typing import Any
 from joblib import delayed
 from tqdm import tqdm
 
-from famle_agent.cluster import Backend, as_completed, parallel
-from famle_agent.whole_file import whole_file
+from famle_agent.utils.atomic_write import whole_file
+from famle_agent.utils.parallel import Backend, as_completed, parallel
 
 __all__ = [
     "Fleet",

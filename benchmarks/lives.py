@@ -18,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from benchmarks.harness import commit, write_whole
 from famle_agent import ModelBasedAgent
-from famle_agent.checkpoint import restore_agent
+from famle_agent.agents.checkpoint import restore_agent
 
 __all__ = ["History", "Repeatable", "read_life", "write_life"]
 

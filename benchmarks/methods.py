@@ -19,11 +19,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from benchmarks import ppo
 from benchmarks.task import Task
 from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent, Transitions
-from famle_agent.checkpoint import load_pretrained
-from famle_agent.envs import situation_envs
-from famle_agent.policies import make_held_uniform
-from famle_agent.robots import known_robots
-from famle_agent.transitions import collect
+from famle_agent.agents.checkpoint import load_pretrained
+from famle_agent.agents.presets import known_robots
+from famle_agent.data.collect import collect
+from famle_agent.data.envs import situation_envs
+from famle_agent.data.policies import make_held_uniform
 
 __all__ = [
     "META_TRAINED",

@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 
 from benchmarks.task import Task
-from famle_agent.whole_file import whole_file
+from famle_agent.utils.atomic_write import whole_file
 from famle_envs.wrappers import RandomSituation
 
 __all__ = ["from_scratch", "learn_simulated", "simulated_first"]

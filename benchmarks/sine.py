@@ -36,13 +36,16 @@ from torch import Tensor
 from benchmarks import command
 from benchmarks.harness import Result, provenance, write_json
 from benchmarks.reporting.statistics import interquartile_mean, quartiles
-from famle_agent.adaptation import Candidates, adapt, prior, window_posterior
-from famle_agent.dynamics import Dynamics
-from famle_agent.inner_loop import InnerLoop
-from famle_agent.maml import MAML
-from famle_agent.memory import Memory
-from famle_agent.meta_learning import Reptile
-from famle_agent.plots import style
+from famle_agent.adaptation.belief import prior
+from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.memory import Memory
+from famle_agent.adaptation.posterior import window_posterior
+from famle_agent.adaptation.update import adapt
+from famle_agent.app.plots import style
+from famle_agent.models.dynamics import Dynamics
+from famle_agent.models.gradient_steps import InnerLoop
+from famle_agent.training.maml import MAML
+from famle_agent.training.reptile import Reptile
 
 N_POINTS = (3, 4, 5)
 HIDDEN = (40, 40)  # Finn et al.'s network

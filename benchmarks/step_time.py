@@ -30,7 +30,7 @@ from benchmarks.harness import Result, provenance, write_json
 from benchmarks.ppo import SETTINGS
 from benchmarks.reporting.study import StepTime
 from famle_agent import AMPC, AMPCMAML, FAMLE
-from famle_agent.robots import known_robots
+from famle_agent.agents.presets import known_robots
 
 HARDLY: Mapping[str, Any] = {
     "rounds": 0,

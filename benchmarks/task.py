@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 
 import famle_envs  # noqa: F401 (registers the robots)
-from famle_agent.robots import known_robots
+from famle_agent.agents.presets import known_robots
 from famle_envs import Situation
 from famle_envs.reality import Profile
 

@@ -43,7 +43,7 @@ class Args(Options):
     methods: tuple[str, ...] = ("ampc-maml",)
     """Entries of benchmarks.methods.META_TRAINED."""
     setting: str = "inner_lr"
-    """One of the fields of famle_agent.hyperparameters.Hyperparameters."""
+    """One of the fields of famle_agent.agents.config.Hyperparameters."""
     values: tuple[str, ...] = ("0.01", "0.03", "0.1")
     """What it is set to, as in JSON."""
     replicates: int = 9

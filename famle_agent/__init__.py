@@ -10,14 +10,14 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from famle_agent.agent import ModelBasedAgent
-    from famle_agent.baselines import AMPC, AMPCMAML
-    from famle_agent.controller import OnlineState
-    from famle_agent.errors import NotLearnedError
-    from famle_agent.famle import FAMLE
-    from famle_agent.hyperparameters import Hyperparameters
-    from famle_agent.transitions import Transitions
-    from famle_agent.wrapper import FAMLEWrapper
+    from famle_agent.adaptation.controller import OnlineState
+    from famle_agent.agents.agent import ModelBasedAgent
+    from famle_agent.agents.baselines import AMPC, AMPCMAML
+    from famle_agent.agents.config import Hyperparameters
+    from famle_agent.agents.famle import FAMLE
+    from famle_agent.agents.wrapper import FAMLEWrapper
+    from famle_agent.data.transitions import Transitions
+    from famle_agent.utils.errors import NotLearnedError
 
 __all__ = [
     "AMPC",
@@ -35,15 +35,15 @@ __all__ = [
 __version__ = version("famle")
 
 _MODULES = {
-    "AMPC": "baselines",
-    "AMPCMAML": "baselines",
-    "FAMLE": "famle",
-    "FAMLEWrapper": "wrapper",
-    "Hyperparameters": "hyperparameters",
-    "ModelBasedAgent": "agent",
-    "NotLearnedError": "errors",
-    "OnlineState": "controller",
-    "Transitions": "transitions",
+    "AMPC": "agents.baselines",
+    "AMPCMAML": "agents.baselines",
+    "FAMLE": "agents.famle",
+    "FAMLEWrapper": "agents.wrapper",
+    "Hyperparameters": "agents.config",
+    "ModelBasedAgent": "agents.agent",
+    "NotLearnedError": "utils.errors",
+    "OnlineState": "adaptation.controller",
+    "Transitions": "data.transitions",
 }
 
 

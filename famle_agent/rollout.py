@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from famle_agent.wrapper import FAMLEWrapper
+from famle_agent.agents.wrapper import FAMLEWrapper
 
 __all__ = ["Frames", "Rollout", "rollout", "running_mean"]
 

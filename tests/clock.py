@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from famle_agent.policies import make_held_uniform
-from famle_agent.transitions import EnvSource, Transitions, collect
+from famle_agent.data.collect import collect
+from famle_agent.data.policies import make_held_uniform
+from famle_agent.data.transitions import EnvSource, Transitions
 
 Array = npt.NDArray[Any]
 LOW, HIGH = np.array([2.0, -6.0], dtype=np.float32), np.array([5.0, -4.0], dtype=np.float32)

@@ -14,7 +14,7 @@ from joblib import parallel_config
 import famle_envs  # noqa: F401 (registers the robots)
 from benchmarks import ppo
 from famle_agent import FAMLE, Transitions
-from famle_agent.robots import known_robots
+from famle_agent.agents.presets import known_robots
 from tests.small_reacher import EPISODE, REDUCED, SMALL_ROLLOUTS
 
 mpl.use("Agg")

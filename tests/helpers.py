@@ -17,10 +17,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from famle_agent import FAMLE, OnlineState, Transitions
-from famle_agent.adaptation import Belief, Candidates, Memory, adapt, prior, window_posterior
-from famle_agent.dynamics import Dynamics, Theta
-from famle_agent.inner_loop import InnerLoop
-from famle_agent.observation import DIMS, ObservationLayout
+from famle_agent.adaptation.belief import Belief, prior
+from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.memory import Memory
+from famle_agent.adaptation.posterior import window_posterior
+from famle_agent.adaptation.update import adapt
+from famle_agent.models.dynamics import Dynamics, Theta
+from famle_agent.models.gradient_steps import InnerLoop
+from famle_agent.models.observation import DIMS, ObservationLayout
 from famle_envs.gait_env import GaitEnv
 from famle_envs.quadruped import QuadrupedEnv
 from famle_envs.reality import Profile

@@ -50,9 +50,9 @@ def test_files_that_the_readme_names_are_there() -> None:
 @pytest.mark.parametrize(
     "module",
     [
-        "famle_agent.baselines",
-        "famle_agent.cluster",
-        "famle_agent.famle",
+        "famle_agent.agents.baselines",
+        "famle_agent.utils.parallel",
+        "famle_agent.agents.famle",
         "famle_envs.situation",
         "famle_envs.reacher",
         "famle_envs.ant",

@@ -14,7 +14,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from benchmarks.reporting.looks import in_order, look
 from benchmarks.reporting.statistics import Array, interquartile_mean
 from benchmarks.reporting.study import Study, quartiles_over_steps
-from famle_agent.plots import style
+from famle_agent.app.plots import style
 
 __all__ = ["draw", "draw_paths", "draw_times"]
 

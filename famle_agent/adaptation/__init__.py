@@ -1,0 +1,1 @@
+"""Algorithm 2: how a model is adapted and planned with."""

@@ -1,0 +1,182 @@
+"""The two ways to adapt a meta-learned model: by its embeddings and gradient steps, or by gradient steps alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from famle_agent.adaptation.belief import Belief, prior
+from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.memory import Memory, Sample, minibatches, whole_memory
+from famle_agent.adaptation.posterior import better_explained, filtered_posterior, window_posterior
+from famle_agent.adaptation.update import descend, select
+from famle_agent.models.dynamics import Dynamics
+from famle_agent.models.gradient_steps import InnerLoop
+from famle_agent.planning import Model, bounded
+
+__all__ = ["Adaptation", "EmbeddingAdapter", "GradientAdapter"]
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """Says how a model is adapted.
+
+    Attributes:
+        inner_loop: U^k on the robot, given the number of transitions that were seen.
+        compose: Whether sums of two embeddings are candidates too.
+        likelihood_power: Exponent of a transition's likelihood.
+        hazard: Probability of a change per step, of a filter over all transitions; 0 takes the window of the last ones.
+        window: W, the transitions of that window.
+        spread_members: Whether the ensemble's members start from situations that are sampled from the posterior.
+        keep_adapting: Whether steps go on from where the last ones led.
+        batch_size: Transitions per step, drawn from the memory; 0 takes all.
+        validation_size: The newest transitions, which decide whether steps are kept; 0 keeps all.
+        clamp_predictions: Whether plans stay within the range of the memory.
+    """
+
+    inner_loop: Callable[[int], InnerLoop]
+    compose: bool = False
+    likelihood_power: float = 1.0
+    hazard: float = 0.0
+    window: int = 50
+    spread_members: bool = False
+    keep_adapting: bool = False
+    batch_size: int = 0
+    validation_size: int = 0
+    clamp_predictions: bool = False
+
+
+@dataclass(frozen=True)
+class EmbeddingAdapter:
+    """FAMLE's: the most likely embedding, or sum of two, then k gradient steps on theta and h.
+
+    Attributes:
+        model: Holds theta_meta and H_meta, which must not change while the adapter is used.
+        settings: How to adapt.
+        seed: Of the minibatches.
+        candidates: The embeddings to select from.
+    """
+
+    model: Dynamics
+    settings: Adaptation
+    seed: int
+    candidates: Candidates = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "candidates", Candidates.of(self.model, self.settings.compose))
+
+    @property
+    def members(self) -> int:
+        """See :class:`~famle_agent.adaptation.controller.Adapter`, here and below."""
+        return self.model.members
+
+    def initial(self, robots: int) -> Belief:
+        """Returns theta_meta with the first situation's embedding."""
+        return prior(self.model, self.candidates, robots)
+
+    def log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Judges a transition by theta_meta with each candidate, and by theta* and h* where steps go on from there."""
+        transition = self.model.encode(obs[:, None], action[:, None], next_obs[:, None])  # (B, 1, ...)
+        power = self.settings.likelihood_power
+        log_p = power * self.candidates.log_likelihood(self.model, transition)[:, 0]  # (B, C)
+        if not self.settings.keep_adapting:
+            return log_p, torch.zeros_like(log_p[:, 0])
+        return log_p, power * belief.log_likelihood(self.model, transition)[:, 0]
+
+    def infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
+        """Filters over all transitions where a hazard is set, else takes the likelihood of the last (the paper)."""
+        if hazard := self.settings.hazard:
+            new = filtered_posterior(self.candidates, belief.log_posterior, memory.log_p[:, -1], hazard)
+            return replace(belief, log_posterior=torch.where(moved[:, None], new, belief.log_posterior))
+        return replace(belief, log_posterior=window_posterior(self.candidates, memory))
+
+    def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
+        """Selects the most likely embedding (line 6), then takes k gradient steps on theta and h (line 7)."""
+        start = self._selected(belief)
+        if self.settings.keep_adapting:
+            changed = better_explained(memory, start.candidate) & (start.candidate != belief.candidate)
+            memory = memory.begun_anew(changed, self.settings.window, start.candidate)
+            start = start.where(changed, replace(belief, adaptations=start.adaptations))
+        return memory, gradient_steps(self.model, start, memory, self.settings, self.seed)
+
+    def model_for(self, belief: Belief, memory: Memory) -> Model:
+        """Returns theta* and h*; where steps go on, the embedding alone as long as it explains the robot better."""
+        if self.settings.keep_adapting:
+            better = better_explained(memory, belief.log_posterior.argmax(dim=1))
+            if better.any():
+                belief = replace(self._selected(belief).where(better, belief), adaptations=belief.adaptations)
+        return simulator_of(self.model, belief, memory, self.settings.clamp_predictions)
+
+    def _selected(self, belief: Belief) -> Belief:
+        return select(self.model, self.candidates, belief, self.settings.spread_members)
+
+
+@dataclass(frozen=True)
+class GradientAdapter:
+    """AMPC's and AMPC-MAML's: k gradient steps on theta, from theta_meta (the paper's eq. 3) or going on.
+
+    Attributes:
+        model: Holds theta_meta and one embedding, which never changes.
+        settings: How to adapt.
+        seed: Of the minibatches.
+    """
+
+    model: Dynamics
+    settings: Adaptation
+    seed: int
+
+    @property
+    def members(self) -> int:
+        """See :class:`~famle_agent.adaptation.controller.Adapter`, here and below."""
+        return self.model.members
+
+    def initial(self, robots: int) -> Belief:
+        """Returns theta_meta."""
+        none = torch.zeros(robots, dtype=torch.long, device=self.model.embeddings.device)
+        theta, h = self.model.theta_of(robots), self.model.embeddings_of(none)
+        log_posterior = torch.zeros(robots, 1, device=self.model.embeddings.device)
+        return Belief(theta, h, log_posterior, candidate=none, diverged=none)
+
+    def log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns zeros: there is one model, and nothing to tell apart."""
+        nothing = torch.zeros(len(obs), device=obs.device)
+        return nothing[:, None], nothing
+
+    def infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
+        """Returns the belief as it is."""
+        return belief
+
+    def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
+        """Takes k gradient steps on theta."""
+        start = belief if self.settings.keep_adapting else self.initial(len(memory.weight))
+        start = replace(start, diverged=belief.diverged, adaptations=belief.adaptations + 1)
+        return memory, gradient_steps(self.model, start, memory, self.settings, self.seed)
+
+    def model_for(self, belief: Belief, memory: Memory) -> Model:
+        """Returns theta*."""
+        return simulator_of(self.model, belief, memory, self.settings.clamp_predictions)
+
+
+def gradient_steps(model: Dynamics, start: Belief, memory: Memory, settings: Adaptation, seed: int) -> Belief:
+    """Takes k steps from where a belief is, on all of the memory or on minibatches of it (line 7)."""
+    sample = _sample(settings.batch_size, seed, start.adaptations - 1, memory)
+    return descend(model, start, memory, settings.inner_loop(memory.seen), settings.validation_size, sample)
+
+
+def _sample(size: int, seed: int, number: int, memory: Memory) -> Sample:
+    """Chooses what the steps of an adaptation see; the same for the same number, so that equal states act alike."""
+    if not size:
+        return whole_memory
+    return minibatches(size, torch.Generator(memory.obs.device).manual_seed(1_000_003 * seed + number))
+
+
+def simulator_of(model: Dynamics, belief: Belief, memory: Memory, clamp: bool) -> Model:
+    """Returns the dynamics of a belief; with ``clamp``, within the range of the memory once robots have adapted."""
+    simulator = model.simulator(belief.theta, belief.h)
+    if not clamp or belief.adaptations == 0:
+        return simulator
+    low, high = (bound.repeat_interleave(model.members, dim=0) for bound in memory.range())
+    return bounded(simulator, low, high)

@@ -1,0 +1,171 @@
+"""Algorithm 2 of the paper on B robots at once: observe a transition, adapt every K steps, plan the next action.
+
+State is a value: each call takes one and returns another, as a recurrent policy does with its hidden state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from famle_agent.adaptation.belief import Belief
+from famle_agent.adaptation.memory import Memory
+from famle_agent.planning import Model, Planner, RewardFn, imagine, shift
+
+__all__ = ["Adapter", "Controller", "OnlineState"]
+
+
+@dataclass(frozen=True)
+class OnlineState:
+    """What B robots carry from one step to the next, as a recurrent policy carries its hidden state. Immutable.
+
+    Attributes:
+        memory: The last M transitions.
+        belief: The adapted model.
+        plan: Where the next search for actions begins, (B, H, action_dim).
+        last: The observation and the action of the last step, (B, obs_dim) and (B, action_dim); None where
+            somebody else reports the transitions.
+        steps: Steps on which at least one robot had a transition.
+        adapted_at: How many of them there were when the robots last adapted at the end of an episode.
+    """
+
+    memory: Memory
+    belief: Belief
+    plan: Tensor
+    last: tuple[Tensor, Tensor] | None = None
+    steps: int = 0
+    adapted_at: int = 0
+
+    @property
+    def robots(self) -> int:
+        """B."""
+        return len(self.plan)
+
+    def resized(self, memory_size: int, window: int, horizon: int) -> OnlineState:
+        """The same for another M, W and H."""
+        plan = torch.cat([self.plan, torch.zeros_like(self.plan[:, :1]).repeat(1, horizon, 1)], dim=1)[:, :horizon]
+        return replace(self, memory=self.memory.resized(memory_size, window), plan=plan)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What :meth:`to_tensors` leaves out, for a checkpoint."""
+        return {"steps": self.steps, "adaptations": self.belief.adaptations, "adapted_at": self.adapted_at}
+
+    def to_tensors(self) -> dict[str, Tensor]:
+        """All but :attr:`last` and the counts, for a checkpoint."""
+        tensors = {f"theta.{name}": value for name, value in self.belief.theta.items()}
+        tensors |= {f"memory.{name}": value for name, value in vars(self.memory).items()}
+        belief = {name: getattr(self.belief, name) for name in ("h", "log_posterior", "candidate", "diverged")}
+        return tensors | belief | {"plan": self.plan}
+
+    @classmethod
+    def from_tensors(cls, tensors: dict[str, Tensor], steps: int, adaptations: int, adapted_at: int) -> OnlineState:
+        """The inverse of :meth:`to_tensors`; the counts are :attr:`counts`."""
+
+        def part(prefix: str) -> dict[str, Tensor]:
+            return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+
+        h, log_posterior, candidate = (tensors[name] for name in ("h", "log_posterior", "candidate"))
+        diverged = tensors.get("diverged", torch.zeros_like(candidate))  # files of version 0.1 do not count
+        belief = Belief(part("theta."), h, log_posterior, candidate, diverged, adaptations)
+        return cls(Memory(**part("memory.")), belief, tensors["plan"], steps=steps, adapted_at=adapted_at)
+
+
+class Adapter(Protocol):
+    """Turns what robots have gone through into the model that they plan with."""
+
+    @property
+    def members(self) -> int:
+        """P, the models of each robot; a plan is judged by their mean."""
+
+    def initial(self, robots: int) -> Belief:
+        """Returns what B robots believe before they have seen anything: theta_meta and a first embedding."""
+
+    def log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Computes log p of a transition of each robot under each candidate, (B, C), and under its belief, (B,)."""
+
+    def infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
+        """Updates the posterior by the newest transition of the robots that ``moved`` (B,)."""
+
+    def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
+        """Takes lines 6 and 7 of Algorithm 2; returns what of the memory still counts then, too."""
+
+    def model_for(self, belief: Belief, memory: Memory) -> Model:
+        """Returns the dynamics that a belief stands for, B * P of them."""
+
+
+@dataclass(frozen=True)
+class Controller:
+    """Runs Algorithm 2.
+
+    Attributes:
+        adapter: Says what robots believe.
+        planner: MPC.
+        reward_fn: r(s, a, s') with actions in [-1, 1].
+        adapt_every: K; 0 never adapts while an episode lasts.
+        adapt_at_reset: Whether to adapt when an episode ends.
+        forget_at_reset: Whether a new episode empties a robot's memory.
+    """
+
+    adapter: Adapter
+    planner: Planner
+    reward_fn: RewardFn
+    adapt_every: int
+    adapt_at_reset: bool = False
+    forget_at_reset: bool = False
+
+    def init(self, memory: Memory) -> OnlineState:
+        """Returns the state of B robots with an empty memory (line 1)."""
+        robots, _, action_dim = memory.action.shape
+        plan = torch.zeros(robots, self.planner.horizon, action_dim, device=memory.action.device)
+        return OnlineState(memory, self.adapter.initial(robots), plan)
+
+    def observe(self, state: OnlineState, obs: Tensor, starts: Tensor) -> OnlineState:
+        """Adds the transition that ends here to the memory (lines 9 and 10), and adapts every K (lines 4 to 7).
+
+        Args:
+            state: The state after the last action.
+            obs: Where the robots are now, (B, obs_dim).
+            starts: Which robots were just reset, (B,): what led here is no transition of theirs.
+        """
+        if state.last is None:
+            return state
+        log_p = self.adapter.log_likelihood(state.belief, *state.last, obs)
+        memory, belief = state.memory.add(*state.last, obs, *log_p, valid=~starts), state.belief
+        if starts.all():
+            return replace(state, last=None)
+        steps = state.steps + 1
+        if self.adapt_every or self.adapt_at_reset:
+            belief = self.adapter.infer(memory, belief, ~starts)
+        if self.adapt_every and steps % self.adapt_every == 0:
+            memory, belief = self.adapter.adapt(memory, belief)
+        return replace(state, memory=memory, belief=belief, last=None, steps=steps)
+
+    @torch.no_grad()
+    def act(
+        self, state: OnlineState, obs: Tensor, starts: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, OnlineState]:
+        """Plans an action in [-1, 1], (B, action_dim), with the adapted model (line 8)."""
+        state = self.reset(state, starts)
+        model, members = self.adapter.model_for(state.belief, state.memory), self.adapter.members
+        action, plan = self.planner.plan(
+            lambda tau: imagine(model, self.reward_fn, obs, tau, members), state.plan, generator
+        )
+        return action, replace(state, plan=shift(plan), last=(obs, action))
+
+    def reset(self, state: OnlineState, starts: Tensor) -> OnlineState:
+        """Voids the plans of the robots in ``starts`` (B,); adapts or empties their memories where it was asked for."""
+        kept = ~starts
+        seen = starts & (state.memory.weight.sum(dim=1) > 0)
+        if self.adapt_at_reset and seen.any() and state.steps > state.adapted_at:
+            memory, belief = self.adapter.adapt(state.memory, state.belief)
+            memory, belief = memory.where(seen, state.memory), belief.where(seen, state.belief)
+            state = replace(state, memory=memory, belief=belief, adapted_at=state.steps)
+        if self.forget_at_reset:
+            memory = replace(state.memory, weight=state.memory.weight * kept[:, None])
+            prior = replace(self.adapter.initial(state.robots), diverged=state.belief.diverged)
+            state = replace(state, memory=memory, belief=state.belief.where(kept, prior))
+        return replace(state, plan=torch.where(kept[:, None, None], state.plan, 0.0))

@@ -1,0 +1,173 @@
+"""What robots have gone through, and which of it a gradient step sees."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from famle_agent.models.dynamics import Batch, Dynamics
+
+__all__ = ["Draw", "Memory", "Sample", "minibatches", "whole_memory"]
+
+
+@dataclass(frozen=True)
+class Memory:
+    """D_M, the last M transitions of B robots, oldest first. Immutable: :meth:`add` returns a new one.
+
+    Attributes:
+        obs: (B, M, obs_dim).
+        action: In [-1, 1], (B, M, action_dim).
+        next_obs: (B, M, obs_dim).
+        log_p: Log-likelihood under each candidate of the newest W transitions, by which candidates are judged,
+            (B, W, C), W <= M. It does not change as long as theta_meta does not, so that it is computed once for each
+            transition.
+        own_log_p: Log-likelihood of the same under what the robot believed when they happened, (B, W).
+        weight: 1 for a transition, 0 for a place that is empty yet, (B, M).
+    """
+
+    obs: Tensor
+    action: Tensor
+    next_obs: Tensor
+    log_p: Tensor
+    own_log_p: Tensor
+    weight: Tensor
+
+    @classmethod
+    def empty(
+        cls,
+        robots: int,
+        size: int,
+        obs_dim: int,
+        action_dim: int,
+        candidates: int,
+        device: torch.device,
+        window: int | None = None,
+    ) -> Memory:
+        """A memory of ``size`` M for B robots that have seen nothing; W is ``window``, None for M."""
+        window = size if window is None else min(window, size)
+        obs, action = (torch.zeros(robots, size, dim, device=device) for dim in (obs_dim, action_dim))
+        log_p = torch.zeros(robots, window, candidates, device=device)
+        return cls(obs, action, obs, log_p, log_p.new_zeros(robots, window), obs.new_zeros(robots, size))
+
+    @classmethod
+    def full(cls, obs: Tensor, action: Tensor, next_obs: Tensor, log_p: Tensor) -> Memory:
+        """A memory of M transitions of each robot, of which nobody knows what the robot believed then."""
+        weight = torch.ones(obs.shape[:2], device=obs.device)
+        return cls(obs, action, next_obs, log_p, torch.zeros_like(weight), weight)
+
+    @property
+    def seen(self) -> int:
+        """Transitions of the robot that has most of them."""
+        return int(self.weight.sum(dim=1).max())
+
+    @property
+    def judging(self) -> Tensor:
+        """The weight of the newest W transitions, (B, W)."""
+        return self.weight[:, self.weight.shape[1] - self.own_log_p.shape[1] :]
+
+    def range(self) -> tuple[Tensor, Tensor]:
+        """Least and largest value of each observed number, (B, obs_dim); infinite for a robot that has seen nothing."""
+        empty = self.weight[..., None] == 0.0
+        low = torch.minimum(self.obs, self.next_obs).masked_fill(empty, math.inf).amin(dim=1)
+        high = torch.maximum(self.obs, self.next_obs).masked_fill(empty, -math.inf).amax(dim=1)
+        nothing = low > high
+        return low.masked_fill(nothing, -math.inf), high.masked_fill(nothing, math.inf)
+
+    def split(self, newest: int) -> tuple[Memory, Memory]:
+        """The same transitions without the newest ones, and with these alone; the others weigh nothing."""
+        is_new = torch.arange(self.weight.shape[1], device=self.weight.device) >= self.weight.shape[1] - newest
+        return replace(self, weight=self.weight * ~is_new), replace(self, weight=self.weight * is_new)
+
+    def resized(self, size: int, window: int) -> Memory:
+        """The newest ``size`` places, with empty ones in front where there are fewer, and ``window`` that judge."""
+
+        def fit(values: Tensor, size: int) -> Tensor:
+            empty = values.new_zeros(len(values), size, *values.shape[2:])
+            return torch.cat([empty, values], dim=1)[:, -size:]
+
+        window = min(window, size)
+        sizes = {name: window if name in ("log_p", "own_log_p") else size for name in vars(self)}
+        return Memory(**{name: fit(values, sizes[name]) for name, values in vars(self).items()})
+
+    def where(self, kept: Tensor, other: Memory) -> Memory:
+        """This memory for the robots in ``kept`` (B,), and the other one for the rest."""
+
+        def choose(mine: Tensor, theirs: Tensor) -> Tensor:
+            return torch.where(kept.view(-1, *[1] * (mine.ndim - 1)), mine, theirs)
+
+        return Memory(**{name: choose(values, getattr(other, name)) for name, values in vars(self).items()})
+
+    def begun_anew(self, rows: Tensor, newest: int, candidate: Tensor) -> Memory:
+        """The memory of robots that take their newest transitions for those of another situation.
+
+        Args:
+            rows: Which robots do, (B,).
+            newest: How many transitions they keep.
+            candidate: What they believe from now on, and as if they had believed it in these transitions, (B,).
+        """
+        _, kept = self.split(newest)
+        weight = torch.where(rows[:, None], kept.weight, self.weight)
+        own_log_p = torch.where(rows[:, None], self.explained_by(candidate), self.own_log_p)
+        return replace(self, own_log_p=own_log_p, weight=weight)
+
+    def explained_by(self, candidate: Tensor) -> Tensor:
+        """The log-likelihood of the newest W transitions under a candidate for each robot (B,), (B, W)."""
+        index = candidate[:, None, None].expand(-1, self.log_p.shape[1], 1)
+        return self.log_p.gather(2, index)[..., 0]
+
+    def add(
+        self, obs: Tensor, action: Tensor, next_obs: Tensor, log_p: Tensor, own_log_p: Tensor, valid: Tensor
+    ) -> Memory:
+        """Inserts one transition per robot where ``valid`` (B,), and drops that robot's oldest."""
+        everywhere = bool(valid.all())  # as nearly always; a second copy of a large memory is worth avoiding
+
+        def push(old: Tensor, new: Tensor) -> Tensor:
+            moved = torch.cat([old[:, 1:], new[:, None]], dim=1)
+            return moved if everywhere else torch.where(valid.view(-1, *[1] * (old.ndim - 1)), moved, old)
+
+        return Memory(
+            push(self.obs, obs),
+            push(self.action, action),
+            push(self.next_obs, next_obs),
+            push(self.log_p, log_p),
+            push(self.own_log_p, own_log_p),
+            push(self.weight, torch.ones_like(valid, dtype=obs.dtype)),
+        )
+
+
+Draw = Callable[[], Batch]
+"""Gives the normalised transitions of the next gradient step, a row for each member of each robot, (B * P, n, ...)."""
+
+Sample = Callable[[Dynamics, Memory], Draw]
+"""Says what gradient steps on a model see of a memory."""
+
+
+def whole_memory(model: Dynamics, memory: Memory) -> Draw:
+    """All transitions in each step, as in the paper."""
+    data = model.encode(memory.obs, memory.action, memory.next_obs, memory.weight)
+    batch = Batch(*(values.repeat_interleave(model.members, dim=0) for values in (data.x, data.y, data.weight)))
+    return lambda: batch
+
+
+def minibatches(size: int, generator: torch.Generator) -> Sample:
+    """Transitions drawn anew for each step, ``size`` of each row, with repetitions."""
+
+    def sample(model: Dynamics, memory: Memory) -> Draw:
+        rows = torch.arange(len(memory.weight), device=memory.weight.device).repeat_interleave(model.members)[:, None]
+        running_number = memory.weight.cumsum(dim=1)[rows[:, 0]]
+
+        def draw() -> Batch:
+            chance = torch.rand(len(rows), size, generator=generator, device=generator.device).to(rows.device)
+            nth = (chance * running_number[:, -1:]).floor()
+            # Of the transitions that count, the nth is where their running number passes n.
+            i = torch.searchsorted(running_number, nth, right=True).clamp(max=memory.weight.shape[1] - 1)
+            drawn = (values[rows, i] for values in (memory.obs, memory.action, memory.next_obs, memory.weight))
+            return model.encode(*drawn)
+
+        return draw
+
+    return sample

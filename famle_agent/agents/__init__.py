@@ -1,0 +1,1 @@
+"""FAMLE and its baselines, with the face of Stable-Baselines3."""

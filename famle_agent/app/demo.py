@@ -1,0 +1,202 @@
+"""Showing that a robot breaks and recovers: the same agent with adaptation and without."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from stable_baselines3.common.logger import Logger, configure
+
+from famle_agent.agents.famle import FAMLE
+from famle_agent.agents.presets import known_robots
+from famle_agent.agents.tensorboard import encode_gif, log_adaptations, log_gif, log_posterior
+from famle_agent.agents.wrapper import FAMLEWrapper
+from famle_agent.app.plots import plot_paths, plot_returns, plot_speed, side_by_side
+from famle_agent.rollout import Rollout, rollout
+
+__all__ = ["DEMOS", "Demo", "run_demo"]
+
+Runs = Mapping[str, Sequence[Rollout]]
+"""The episodes of each agent, by its name."""
+
+_FILM_FPS = 10.0
+
+
+@dataclass(frozen=True)
+class Demo:
+    """What is shown of a robot.
+
+    Attributes:
+        situation: What breaks, unless somebody says otherwise.
+        breaks_at: The episode and the step in it before which the robot breaks.
+        episodes: How many there are.
+        env: Arguments of the environment.
+        picture: Draws the episodes into a file.
+    """
+
+    situation: str
+    breaks_at: tuple[int, int]
+    episodes: int
+    picture: Callable[[Runs, gym.Env[Any, Any], Path], None]
+    env: Mapping[str, Any] = field(default_factory=dict)
+
+
+def run_demo(
+    robot: str = "reacher", situation: str = "", out: Path = Path("demo"), seed: int = 0, **overrides: Any
+) -> dict[str, list[Rollout]]:
+    """Breaks a robot and runs it, with adaptation and without.
+
+    Args:
+        robot: The robot's name. Its shipped model is used, or one is meta-learned where none is shipped.
+        situation: What breaks: a preset or a description; empty takes the robot's own.
+        out: Folder for the agent, the picture, the film and TensorBoard.
+        seed: Seed of everything.
+        **overrides: Fields of the robot's :class:`Demo`, or settings of the agent.
+
+    Returns:
+        The episodes of each agent, by its name.
+
+    Raises:
+        ValueError: The robot, the situation or the break is unknown.
+    """
+    shown, settings = _demo_of(robot, overrides)
+    situation, console = situation or shown.situation, Console()
+    env = gym.make(known_robots()[robot].env_id, render_mode="rgb_array", **shown.env)
+    try:
+        # A wrong name should fail before minutes of learning.
+        env.unwrapped.set_situation(situation)  # type: ignore[attr-defined]
+        label = env.get_wrapper_attr("situation").label
+        agents = _with_and_without_adaptation(robot, seed, out, settings, console)
+        runs: dict[str, list[Rollout]] = {}
+        for name, agent in agents.items():
+            with console.status(f"Running {name} ..."):
+                runs[name] = _run(agent, env, situation, shown, seed, out / "tensorboard" / name.replace(" ", "_"))
+        console.print(_table(runs, f"{robot}: {label}"))
+        shown.picture(runs, env, out)
+        films = {name: [frame for run in episodes for frame in run.frames] for name, episodes in runs.items()}
+        (out / "robot.gif").write_bytes(encode_gif(side_by_side(films), _film_rate(env)))
+    finally:
+        env.close()
+    written = ", ".join(sorted(path.name for path in out.iterdir() if path.is_file()))
+    console.print(f"Written to {out}/: {written}; see also tensorboard --logdir {out}/tensorboard")
+    return runs
+
+
+def _demo_of(robot: str, overrides: Mapping[str, Any]) -> tuple[Demo, dict[str, Any]]:
+    """Divides what somebody changed into the demo's part and the agent's."""
+    if robot not in DEMOS:
+        raise ValueError(f"There is a demo of {', '.join(DEMOS)}, not of {robot!r}.")
+    own = {name: value for name, value in overrides.items() if name in ("breaks_at", "episodes", "env")}
+    shown = replace(DEMOS[robot], **own)
+    episode, step = shown.breaks_at
+    limit = shown.env.get("max_episode_steps")
+    if not 0 <= episode < shown.episodes or step < 0 or (limit is not None and step >= limit):
+        within = f"{shown.episodes} episodes" + ("" if limit is None else f" of {limit} steps")
+        raise ValueError(f"breaks_at, an episode and a step, must lie within {within}; got {shown.breaks_at}.")
+    return shown, {name: value for name, value in overrides.items() if name not in own}
+
+
+def _with_and_without_adaptation(
+    robot: str, seed: int, out: Path, settings: Mapping[str, Any], console: Console
+) -> dict[str, FAMLE]:
+    agent = FAMLE(robot, seed=seed, tensorboard_log=str(out / "tensorboard"), **settings)
+    if agent.dynamics is None:
+        console.print(f"[bold]FAMLE on {robot}[/bold]: meta-learning in simulation.")
+        start = time.perf_counter()
+        agent.meta_learn(progress_bar=True, n_jobs=-1)
+        console.print(f"Meta-learned {len(agent.situations)} situations in {time.perf_counter() - start:.0f} s.")
+    out.mkdir(parents=True, exist_ok=True)
+    agent.save(out / "agent.zip")
+    return {"with adaptation": agent, "without adaptation": FAMLE.load(out / "agent.zip", adapt_every=0)}
+
+
+def _run(agent: FAMLE, env: gym.Env[Any, Any], situation: str, shown: Demo, seed: int, log: Path) -> list[Rollout]:
+    """Runs the episodes of one agent, and logs each step, each episode and the film of the last one."""
+    agent.set_random_seed(seed)
+    env.unwrapped.set_situation(None)  # type: ignore[attr-defined]
+    wrapped, logger, runs, done = FAMLEWrapper(env, agent), configure(str(log), ["tensorboard"]), list[Rollout](), 0
+    film_every = max(1, round(1.0 / (env.get_wrapper_attr("control_period") * _FILM_FPS)))
+    for episode in range(shown.episodes):
+        breaks_at = shown.breaks_at[1] if episode == shown.breaks_at[0] else None
+        filmed = film_every if episode in (0, shown.breaks_at[0], shown.episodes - 1) else 0
+        on_step = _step_logger(logger, agent, done)
+        runs.append(rollout(wrapped, seed if episode == 0 else None, situation, breaks_at, filmed, on_step))
+        done += runs[-1].steps
+        logger.record("episode/return", runs[-1].total)
+        logger.dump(done)
+    log_gif(logger, "robot/last_episode", runs[-1].frames, _film_rate(env), done)
+    logger.close()
+    return runs
+
+
+def _step_logger(logger: Logger, agent: FAMLE, first: int) -> Callable[[int, float], None]:
+    def on_step(step: int, reward: float) -> None:
+        logger.record("step/reward", reward)
+        log_posterior(logger, agent.marginals())
+        log_adaptations(logger, agent.belief)
+        logger.dump(first + step)
+
+    return on_step
+
+
+def _film_rate(env: gym.Env[Any, Any]) -> float:
+    """Pictures per second of the film; a robot of one action a second is shown faster than it is."""
+    return min(_FILM_FPS, max(4.0, 1.0 / float(env.get_wrapper_attr("control_period"))))
+
+
+def _table(runs: Runs, title: str) -> Table:
+    """One row an episode; one that the robot breaks in has two, with the return of 1,000 steps at that rate."""
+    table = Table("episode", *(f"return {name}" for name in runs), "believes at the end", "per step", title=title)
+    adapting = next(iter(runs.values()))
+    for i, run in enumerate(adapting):
+        cells = [_outcome(episodes[i]) for episodes in runs.values()]
+        milliseconds = f"{1e3 * np.median(run.step_seconds):.0f} ms"
+        table.add_row(str(i), *cells, f"{run.situations[-1]} ({run.probability:.0%})", milliseconds)
+    return table
+
+
+def _outcome(run: Rollout) -> str:
+    ending = " at the goal" if run.success else " fell" if run.fell else ""
+    parts = [f"{run.total:.1f} in {run.steps} steps{ending}"]
+    if run.breaks_at:
+        before, after = run.reward[: run.breaks_at].mean(), run.reward[run.breaks_at :].mean()
+        parts.append(f"a step {before:.2f} before the break, {after:.2f} after")
+    return ", ".join(parts)
+
+
+# --- the robots -------------------------------------------------------------------------------------------------------
+
+
+def _draw_returns(runs: Runs, env: gym.Env[Any, Any], out: Path) -> None:
+    returns = {name: [run.total for run in episodes] for name, episodes in runs.items()}
+    plot_returns(returns, f"{env.spec.id if env.spec else ''}", out / "returns.png")
+
+
+def _draw_speed(runs: Runs, env: gym.Env[Any, Any], out: Path) -> None:
+    speed = {name: episodes[-1].reward for name, episodes in runs.items()}
+    broken = next(iter(runs.values()))[-1]
+    rate = 1.0 / env.get_wrapper_attr("control_period")
+    plot_speed(speed, broken.breaks_at or 0, rate, env.get_wrapper_attr("situation").label, out / "speed.png")
+
+
+def _draw_path(runs: Runs, env: gym.Env[Any, Any], out: Path) -> None:
+    paths = {name: episodes[-1].position for name, episodes in runs.items()}
+    goal = env.get_wrapper_attr("goal") if env.has_wrapper_attr("goal") else None
+    title = f"{env.get_wrapper_attr('situation').label}, profile {str(env.get_wrapper_attr('profile'))!r}"
+    plot_paths(paths, title, out / "path.png", goal)
+
+
+DEMOS: Mapping[str, Demo] = {
+    "reacher": Demo("paper", (1, 0), 6, _draw_returns),
+    "ant": Demo("joint 2 dead, yaw sensor off by 60 deg", (0, 300), 1, _draw_speed, {"max_episode_steps": 900}),
+    "quadruped": Demo("paper", (0, 0), 1, _draw_path, {"profile": "reality"}),
+    "minitaur": Demo("intact", (0, 0), 1, _draw_path, {"profile": "reality"}),
+}
+"""What is shown of each robot."""

@@ -1,0 +1,284 @@
+"""From whatever a user calls an environment to environments, one per situation."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from itertools import chain, count
+from typing import Any
+
+import gymnasium as gym
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from stable_baselines3.common.vec_env import VecEnv
+
+from famle_agent.data.policies import reward_names
+from famle_agent.data.transitions import EnvSource
+from famle_agent.planning import RewardFn
+from famle_envs.reality import Profile
+from famle_envs.situation import Situation
+
+__all__ = [
+    "NEW_OBSERVATIONS",
+    "EnvLike",
+    "SituationEnvs",
+    "changing_wrappers",
+    "check_spaces",
+    "env_attribute",
+    "env_id",
+    "env_spec",
+    "planning_reward",
+    "situation_envs",
+]
+
+EnvLike = gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]] | Situation | Mapping[str, Any] | str
+"""An environment, a factory of one, or the situation of one."""
+
+
+def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+    """Refuses what a dynamics model cannot predict.
+
+    Raises:
+        ValueError: A space is no one-dimensional Box, or the actions are not bounded.
+    """
+    for name, space in (("observation", observation_space), ("action", action_space)):
+        if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+            raise ValueError(
+                f"The {name} space must be a one-dimensional Box, got {space}. For a dictionary or an image, use "
+                "gymnasium.wrappers.FlattenObservation; discrete actions are not supported."
+            )
+    if not action_space.is_bounded("both"):  # type: ignore[attr-defined]
+        raise ValueError(f"The action space must be bounded, got {action_space}; use gymnasium.wrappers.RescaleAction.")
+
+
+def env_id(env: VecEnv) -> str | None:
+    """The Gymnasium id of an environment, whatever wraps it; None where it was not registered."""
+    spec: EnvSpec | None = env.get_attr("spec")[0]
+    return None if spec is None else spec.id
+
+
+def env_spec(env: VecEnv) -> dict[str, Any] | None:
+    """The Gymnasium id, arguments and time limit of an environment as JSON types, if that is all there is to say."""
+    spec = _plain_spec(env)
+    if spec is None:
+        return None
+    kwargs = {key: _plain(value) for key, value in spec.kwargs.items()}
+    try:
+        json.dumps(kwargs)
+    except TypeError:  # an argument that no file can name
+        return None
+    return {"id": spec.id, "kwargs": kwargs, "max_episode_steps": spec.max_episode_steps}
+
+
+NEW_OBSERVATIONS = frozenset(
+    {
+        *("FilterObservation", "FrameStackObservation", "NormalizeObservation", "RescaleObservation"),
+        *("ReshapeObservation", "TimeAwareObservation", "TransformObservation"),
+    }
+)
+"""Gymnasium's wrappers after which an observation means something else; a delayed or noisy one means the same."""
+NEW_ACTIONS = frozenset({"RescaleAction", "TransformAction"})
+"""The same for actions."""
+_ONLOOKERS = frozenset({"Monitor", "RecordEpisodeStatistics", "RecordVideo", "HumanRendering"})
+"""Wrappers that change nothing of what a robot and its agent tell each other."""
+
+
+def _plain(value: Any) -> Any:
+    """An argument as JSON types, where it is one of ours."""
+    if isinstance(value, Situation):
+        return value.to_dict()
+    return asdict(value) if isinstance(value, Profile) else value
+
+
+def _plain_spec(env: VecEnv) -> EnvSpec | None:
+    """The spec of a registered environment whose wrappers, if any, only look on."""
+    spec: EnvSpec | None = env.get_attr("spec")[0]
+    if spec is None or not _ONLOOKERS.issuperset(wrapper.name for wrapper in spec.additional_wrappers):
+        return None
+    return spec
+
+
+@dataclass(frozen=True)
+class SituationEnvs:
+    """One environment per training situation.
+
+    Attributes:
+        sources: Each environment that the user gave, or what makes it.
+        situations: What each situation is called; no two alike.
+    """
+
+    sources: list[EnvSource]
+    situations: list[str]
+
+
+def situation_envs(env: VecEnv, envs: Sequence[EnvLike] | None, episode_length: int = 0) -> SituationEnvs:
+    """One environment per training situation.
+
+    Args:
+        env: The agent's own environment; situations are put into new ones of its kind.
+        envs: What the user gave; None takes the training situations that the environment names.
+        episode_length: Steps that an episode of each must be able to last; 0 asks for no more than their time limit.
+
+    Raises:
+        ValueError: No situation is given or known, the environment takes no ``situation``, the spaces of one differ
+            from the agent's, one has a profile other than the simulator's, or ends its episodes too early.
+    """
+    if envs is None:
+        envs = list(env_attribute(env, "training_situations", ()))
+        if not envs:
+            raise ValueError(
+                "This environment names no training situations. Call meta_learn(envs) with a list that holds one "
+                "environment, one factory or one Situation per situation."
+            )
+    if isinstance(envs, (str, Mapping, Situation, gym.Env, VecEnv)) or not isinstance(envs, Sequence):
+        raise ValueError(
+            f"meta_learn(envs) needs a list with one environment, factory or Situation per situation, got "
+            f"{type(envs).__name__}; put a single one into a list."
+        )
+    if len(envs) == 0:
+        raise ValueError("meta_learn(envs) needs at least one environment, factory or Situation.")
+    sources, labels = [_source(env, item, episode_length) for item in envs], list[str]()
+    for i, source in enumerate(sources):
+        made = source if isinstance(source, gym.Env) else source()
+        try:
+            _check_same_spaces(made, env)
+            _check_simulated(made)
+            _check_time_limit(made, episode_length)
+            situation = _get(made, "situation", None)
+        finally:
+            if made is not source:
+                made.close()
+        label = situation.label if isinstance(situation, Situation) else f"situation {i}"
+        names = chain([label], (f"{label} ({j})" for j in count(i)))
+        labels.append(next(name for name in names if name not in labels))
+    return SituationEnvs(sources, labels)
+
+
+def _source(env: VecEnv, item: EnvLike, episode_length: int) -> EnvSource:
+    if isinstance(item, gym.Env):
+        return item
+    if isinstance(item, (Situation, Mapping, str)):
+        spec = _plain_spec(env)
+        if spec is None:
+            raise ValueError(
+                "Situations need a registered environment without wrappers; give environments or factories instead."
+            )
+        # Who only looks on, as the Monitor that Stable-Baselines3 puts around an environment, is no part of the robot.
+        spec = replace(spec, additional_wrappers=())
+        if episode_length:
+            spec = replace(spec, max_episode_steps=episode_length)
+        return partial(_make_situation, spec, item)
+    if not callable(item):
+        raise ValueError(
+            f"A situation is an environment, a factory of one, a Situation, a mapping or a name, got "
+            f"{type(item).__name__}."
+        )
+    return partial(_make_from_factory, item)
+
+
+def _make_situation(spec: EnvSpec, situation: Situation | Mapping[str, Any] | str) -> gym.Env[Any, Any]:
+    try:
+        return gym.make(spec, render_mode=None, situation=situation)
+    except TypeError as error:
+        if "unexpected keyword argument 'situation'" not in str(error):
+            raise
+        raise ValueError(f"{spec.id} takes no situation; give environments or factories instead.") from error
+
+
+def _make_from_factory(factory: Callable[[], gym.Env[Any, Any]]) -> gym.Env[Any, Any]:
+    made = factory()
+    if not isinstance(made, gym.Env):
+        raise ValueError(f"A factory must return a Gymnasium environment, got {type(made).__name__}.")
+    return made
+
+
+def _check_same_spaces(made: gym.Env[Any, Any], env: VecEnv) -> None:
+    if made.observation_space != env.observation_space or made.action_space != env.action_space:
+        raise ValueError(
+            f"Each situation must have the agent's spaces, {env.observation_space} and {env.action_space}; "
+            f"got {made.observation_space} and {made.action_space}."
+        )
+
+
+def _check_simulated(made: gym.Env[Any, Any]) -> None:
+    profile = _get(made, "profile", None)
+    if isinstance(profile, Profile) and not profile.is_simulator:
+        raise ValueError(
+            f"The profile {profile.name!r} stands for the robot that an agent is made for, and no agent meta-learns on "
+            "it. Meta-learn on environments without a profile, then run the agent on this one."
+        )
+
+
+def _check_time_limit(made: gym.Env[Any, Any], episode_length: int) -> None:
+    limit = None if made.spec is None else made.spec.max_episode_steps
+    if limit is not None and limit < episode_length:
+        raise ValueError(
+            f"Simulated episodes should have {episode_length} steps (the setting episode_length), but the environment "
+            f"ends them after {limit}. Make it with gym.make(..., max_episode_steps={episode_length}), or give "
+            "episode_length=0 to take its own limit."
+        )
+
+
+def planning_reward(env: VecEnv, name: str) -> RewardFn | None:
+    """What a planner should maximise in an environment, where it says that.
+
+    Args:
+        env: The environment.
+        name: What it calls it; empty takes the first of :data:`~famle_agent.data.policies.REWARDS` that it has.
+
+    Raises:
+        ValueError: It has nothing of that name; or it has, but a wrapper changes what it would be given, or the robots
+            of a ``VecEnv`` have different tasks.
+    """
+    if name and not env.has_attr(name):
+        raise ValueError(f"The environment has no {name!r}; planning_reward must name a function of it, or be empty.")
+    known = [reward for reward in reward_names(name) if env.has_attr(reward)]
+    if not known:
+        return None
+    if changed := changing_wrappers(env):
+        raise ValueError(
+            f"The environment's {known[0]} is of what {', '.join(changed)} changes; give the reward of the wrapped "
+            "observations and actions (reward_fn=...), or the environment without that wrapper."
+        )
+    if len(tasks := sorted(set(_tasks(env)))) > 1:
+        raise ValueError(
+            f"The robots of this VecEnv have different tasks ({'; '.join(tasks)}), and an agent plans for one. "
+            "Give a reward_fn that finds the task in the observation, or each task an agent of its own."
+        )
+    reward_fn: RewardFn = env_attribute(env, known[0], None)
+    return reward_fn
+
+
+def changing_wrappers(env: VecEnv, changed: frozenset[str] = NEW_OBSERVATIONS | NEW_ACTIONS) -> list[str]:
+    """Names of the wrappers between an environment and its agent that change the meaning of what passes.
+
+    Args:
+        env: The environment. Where it is not registered, its wrappers are not known.
+        changed: Wrappers of Gymnasium that count. One of a ``VecEnv`` that changes the shape of observations does too.
+    """
+    spec: EnvSpec | None = env.get_attr("spec")[0]
+    found = [] if spec is None else [item.name for item in spec.additional_wrappers if item.name in changed]
+    if env.observation_space.shape != env_attribute(env, "observation_space", env.observation_space).shape:
+        found.append(type(env).__name__)
+    return found
+
+
+def _tasks(env: VecEnv) -> list[str]:
+    """What each robot of a ``VecEnv`` should do, as far as the arguments of its environment say that."""
+    specs: list[EnvSpec | None] = env.get_attr("spec")
+    asked = [{} if spec is None else {k: v for k, v in spec.kwargs.items() if k not in _NO_TASK} for spec in specs]
+    return [json.dumps(kwargs, default=repr, sort_keys=True) for kwargs in asked]
+
+
+_NO_TASK = frozenset({"situation", "profile", "render_mode"})
+
+
+def _get(env: gym.Env[Any, Any], name: str, default: Any) -> Any:
+    return env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else default
+
+
+def env_attribute(env: VecEnv, name: str, default: Any) -> Any:
+    """An attribute of the first environment."""
+    return env.get_attr(name)[0] if env.has_attr(name) else default

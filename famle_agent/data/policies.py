@@ -1,0 +1,149 @@
+"""What chooses the actions while transitions are simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from famle_agent.data.action_scaling import ActionScale, to_action_space
+from famle_agent.models.dynamics import Dynamics
+from famle_agent.planning import Model, Planner, RewardFn, imagine, shift
+
+__all__ = [
+    "REWARDS",
+    "HeldUniformPolicy",
+    "MakePolicy",
+    "PlanningPolicy",
+    "make_held_uniform",
+    "make_planning",
+    "reward_names",
+]
+
+Array = npt.NDArray[Any]
+
+
+class Policy(Protocol):
+    """Chooses actions."""
+
+    def __call__(self, obs: Array, episode_start: bool) -> Array:
+        """The action for an observation, in the environment's action space."""
+
+
+REWARDS = ("planning_reward_fn", "reward_fn")
+"""What an environment may call the function that a planner should maximise; the first that it has counts."""
+
+
+def reward_names(named: str) -> tuple[str, ...]:
+    """What to ask an environment for: the function that was named, else the first of :data:`REWARDS` that it has."""
+    return (named,) if named else REWARDS
+
+
+MakePolicy = Callable[[gym.Env[Any, Any], int, np.random.Generator], Policy]
+"""A policy for an environment and the index of its situation; picklable where data are collected in processes."""
+
+
+class HeldUniformPolicy:
+    """Uniformly random actions, each held for some steps.
+
+    ``hold=1`` are the paper's independent actions. Held ones carry a robot further from its start for the
+    same number of steps.
+    """
+
+    def __init__(self, action_space: gym.spaces.Box, hold: int, rng: np.random.Generator) -> None:
+        self._space, self._hold, self._rng = action_space, hold, rng
+        self._age = 0
+        self._action: Array | None = None
+
+    def __call__(self, obs: Array, episode_start: bool) -> Array:
+        """The held action, or a new one when its time is over or an episode begins."""
+        if episode_start or self._action is None or self._age >= self._hold:
+            self._action, self._age = self._rng.uniform(self._space.low, self._space.high), 0
+        self._age += 1
+        return self._action.astype(self._space.dtype)
+
+
+class PlanningPolicy:
+    """The agent's own planning, with a model that does not change."""
+
+    def __init__(
+        self,
+        model: Model,
+        members: int,
+        reward_fn: RewardFn,
+        planner: Planner,
+        action_space: gym.spaces.Box,
+        generator: torch.Generator,
+    ) -> None:
+        self._model, self._members, self._reward_fn = model, members, reward_fn
+        self._planner, self._space, self._generator = planner, action_space, generator
+        self._plan: Tensor | None = None
+
+    @torch.no_grad()
+    def __call__(self, obs: Array, episode_start: bool) -> Array:
+        """Plans from where the last plan left off."""
+        if self._plan is None or episode_start:
+            self._plan = torch.zeros(1, self._planner.horizon, *self._space.shape)
+        state = torch.as_tensor(obs, dtype=torch.float32)[None]
+
+        def judge(tau: Tensor) -> Tensor:
+            return imagine(self._model, self._reward_fn, state, tau, self._members)
+
+        action, plan = self._planner.plan(judge, self._plan, self._generator)
+        self._plan = shift(plan)
+        return to_action_space(action[0], self._space)
+
+
+@dataclass(frozen=True)
+class make_held_uniform:  # noqa: N801 (a function with arguments bound, which can be pickled)
+    """Makes a :class:`HeldUniformPolicy`.
+
+    Attributes:
+        hold: Steps that an action is held.
+    """
+
+    hold: int
+
+    def __call__(self, env: gym.Env[Any, Any], situation: int, rng: np.random.Generator) -> Policy:
+        """See :data:`MakePolicy`."""
+        return HeldUniformPolicy(env.action_space, self.hold, rng)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class make_planning:  # noqa: N801
+    """Makes a :class:`PlanningPolicy` that knows which situation it is in.
+
+    Attributes:
+        model: On the CPU.
+        planner: Looks for the actions.
+        reward_fn: r(s, a, s') for actions of the environment; None takes the environment's own.
+        rewards: What the environment may call its own; the first that it has counts.
+    """
+
+    model: Dynamics
+    planner: Planner
+    reward_fn: RewardFn | None
+    rewards: tuple[str, ...] = REWARDS
+
+    @torch.no_grad()
+    def __call__(self, env: gym.Env[Any, Any], situation: int, rng: np.random.Generator) -> Policy:
+        """See :data:`MakePolicy`."""
+        scale = ActionScale.of(env.action_space, torch.device("cpu"))  # type: ignore[arg-type]
+        own = (env.get_wrapper_attr(name) for name in self.rewards if env.has_wrapper_attr(name))
+        in_env_units: RewardFn = self.reward_fn or next(own)
+        h = self.model.embeddings_of(torch.tensor([situation]))
+        simulator = self.model.simulator(self.model.parameters_by_name(), h)
+        return PlanningPolicy(
+            simulator,
+            self.model.members,
+            lambda obs, action, next_obs: in_env_units(obs, scale.from_unit(action), next_obs),
+            self.planner,
+            env.action_space,  # type: ignore[arg-type]
+            torch.Generator().manual_seed(int(rng.integers(2**63))),
+        )

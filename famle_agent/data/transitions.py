@@ -1,0 +1,108 @@
+"""The transitions D of N situations, and storing them."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from famle_agent.utils.atomic_write import whole_file
+
+__all__ = ["EnvSource", "Transitions"]
+
+Array = npt.NDArray[np.float32]
+EnvSource = gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]]
+"""An environment, used where it is and left open; or what makes one, in whatever process, to be closed after use."""
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """n transitions (s, a, r, s') of each of N situations, in the environments' units.
+
+    Attributes:
+        obs: (N, n, obs_dim).
+        action: (N, n, action_dim).
+        reward: (N, n).
+        next_obs: (N, n, obs_dim).
+        situations: What each situation is called, N of them.
+
+    Raises:
+        ValueError: Shapes do not fit, or a value is not finite.
+    """
+
+    obs: Array
+    action: Array
+    reward: Array
+    next_obs: Array
+    situations: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        shape = (len(self.situations), self.obs.shape[1] if self.obs.ndim == 3 else -1)
+        if 0 in shape:
+            raise ValueError("There are no transitions; collect at least one in at least one situation.")
+        for name in ("obs", "action", "reward", "next_obs"):
+            value = getattr(self, name)
+            if value.shape[:2] != shape or value.ndim != (2 if name == "reward" else 3):
+                raise ValueError(f"{name} has shape {value.shape}; expected {shape} and the dimensions behind it.")
+            if not np.isfinite(value).all():
+                raise ValueError(f"{name} holds values that are not finite; collect the transitions again.")
+        if self.obs.shape != self.next_obs.shape:
+            raise ValueError(f"obs {self.obs.shape} and next_obs {self.next_obs.shape} must have the same shape.")
+
+    def followed_by(self, others: Transitions) -> Transitions:
+        """More transitions of the same situations, behind these.
+
+        Raises:
+            ValueError: The situations differ.
+        """
+        if self.situations != others.situations:
+            raise ValueError(f"Transitions of {others.situations} cannot follow those of {self.situations}.")
+        names = ("obs", "action", "reward", "next_obs")
+        arrays = {name: np.concatenate([getattr(self, name), getattr(others, name)], axis=1) for name in names}
+        return Transitions(**arrays, situations=self.situations)
+
+    def digest(self) -> str:
+        """A short text that other transitions do not share."""
+        digest = hashlib.sha256(repr(self.situations).encode())
+        for values in (self.obs, self.action, self.reward, self.next_obs):
+            digest.update(np.ascontiguousarray(values).tobytes())
+        return digest.hexdigest()[:16]
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes a compressed NumPy archive; an older file stays whole until the new one is complete."""
+        arrays = {name: getattr(self, name) for name in ("obs", "action", "reward", "next_obs")}
+        with whole_file(Path(path)) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, **arrays, situations=np.array(self.situations))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Transitions:
+        """Reads what :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: The file is truncated or holds something else.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in ("obs", "action", "reward", "next_obs")}
+                situations = tuple(str(name) for name in archive["situations"])
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            EOFError,
+            KeyError,
+            NotImplementedError,
+            TypeError,
+            ValueError,
+        ) as error:
+            raise ValueError(f"{path} holds no transitions, or not all of them; collect them again.") from error
+        return cls(**arrays, situations=situations)

@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import pytest
+
+from famle_agent import FAMLE, FAMLEWrapper
+from famle_agent.agents.presets import known_robots
+from famle_agent.rollout import rollout
+
+MakeEnv = Callable[..., gym.Env[Any, Any]]
+ROBOTS = {"quadruped": 20, "minitaur": 9}
+
+
+@pytest.mark.parametrize(("robot", "n_situations"), ROBOTS.items())
+def test_package_ships_a_small_model_of_these_settings(robot: str, n_situations: int) -> None:
+    agent = FAMLE(robot, seed=0, device="cpu")
+    agent.get_env().close()
+    assert agent.dynamics is not None
+    assert agent.dynamics.members == agent.hyperparameters.members
+    assert len(agent.situations) == n_situations
+    assert agent.situations[0] == "intact"
+    file = known_robots()[robot].pretrained
+    assert file is not None
+    assert len(file.read_bytes()) < 2_000_000
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_shipped_model_serves_a_robot_in_reality(robot: str, make_env: MakeEnv) -> None:
+    env = make_env(known_robots()[robot].env_id, profile="reality")
+    assert FAMLE(env, device="cpu").dynamics is not None
+
+
+def test_shipped_model_serves_any_goal(make_env: MakeEnv) -> None:
+    agent = FAMLE("quadruped", seed=0, device="cpu")
+    agent.get_env().close()
+    for goal in ((0.0, 1.0), (-1.0, -0.5)):
+        env = make_env("FamleQuadruped-v0", goal=goal)
+        served = FAMLE(env, seed=0, device="cpu")
+        run = rollout(FAMLEWrapper(env, served), seed=0)
+        assert run.success
+        assert run.steps < 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("situation", ["back right leg blocked", "yaw sensor off by 30 deg"])
+def test_quadruped_reaches_its_goal_in_reality(situation: str, make_env: MakeEnv) -> None:
+    agent = FAMLE("quadruped", seed=0, device="cpu")
+    agent.get_env().close()
+    env = make_env("FamleQuadruped-v0", situation=situation, profile="reality")
+    assert rollout(FAMLEWrapper(env, agent), seed=0).success
+
+
+@pytest.mark.slow
+def test_minitaur_walks_in_reality(make_env: MakeEnv) -> None:
+    agent = FAMLE("minitaur", seed=0, device="cpu")
+    agent.get_env().close()
+    env = make_env("FamleMinitaur-v0", profile="reality", max_episode_steps=20)
+    run = rollout(FAMLEWrapper(env, agent), seed=0)
+    assert not run.fell
+    assert run.position[-1, 0] > 2.0

@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from famle_agent import FAMLE
+from famle_agent.app.cli import main
+from famle_agent.app.demo import run_demo
+
+slow = pytest.mark.slow
+
+
+def scalars(folder: Path) -> list[str]:
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    return events.Tags()["scalars"]
+
+
+@slow
+def test_demo_of_the_arm_writes_all_it_promises(
+    tmp_path: Path, tiny_budgets: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "results" / "demo"
+    main(["demo", "--out", str(out), "--episodes", "2", "--meta-iterations", "2", "--situation", "joint 3 dead"])
+    with Image.open(out / "returns.png") as plot, Image.open(out / "robot.gif") as film:
+        assert plot.size[0] > 100
+        assert film.n_frames > 1
+        assert film.size[0] > 1.5 * film.size[1]  # two films next to each other
+    agent = FAMLE.load(out / "agent.zip", device="cpu")
+    assert agent.hyperparameters.meta_iterations == 2
+    assert len(agent.situations) == 11
+    agent.get_env().close()
+    assert "meta/loss_after" in scalars(out / "tensorboard" / "FAMLE_meta_1")
+    expected = {"step/reward", "episode/return", "posterior/joint 3 dead", "adapt/adaptations", "adapt/diverged"}
+    for name in ("with_adaptation", "without_adaptation"):
+        assert expected <= set(scalars(out / "tensorboard" / name))
+    shown = capsys.readouterr().out
+    assert "joint 3 dead" in shown
+    assert "returns.png" in shown
+
+
+@slow
+def test_demo_gives_its_episodes(tmp_path: Path, tiny_budgets: None) -> None:
+    runs = run_demo(situation="joint 0 reversed", episodes=2, out=tmp_path, seed=1, candidates=5)
+    assert list(runs) == ["with adaptation", "without adaptation"]
+    for episodes in runs.values():
+        assert [run.breaks_at for run in episodes] == [None, 0]
+        assert all(0 < run.total < 6 for run in episodes)
+        assert all(len(run.frames) == run.steps == 6 for run in episodes)
+    assert runs["without adaptation"][1].probability == pytest.approx(1 / 11)
+
+
+@slow
+def test_demo_shows_the_ant_before_at_and_after_the_break(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runs = run_demo("ant", out=tmp_path, env={"max_episode_steps": 240}, breaks_at=(0, 120))
+    (adapting,), (frozen,) = runs.values()
+    assert adapting.reward[60:120].mean() > 0.8
+    assert adapting.reward[-60:].mean() > 0.8
+    assert adapting.situations[119] == "intact"
+    assert adapting.situations[-1] == "joint 2 dead + yaw sensor off by 60 deg"
+    assert set(frozen.situations) == {"intact"}
+    assert "before the break" in " ".join(capsys.readouterr().out.split())
+    with Image.open(tmp_path / "speed.png") as plot, Image.open(tmp_path / "robot.gif") as film:
+        assert min(plot.size) > 100
+        assert film.n_frames > 20
+    assert FAMLE.load(tmp_path / "agent.zip", device="cpu").dynamics is not None
+
+
+@slow
+def test_demo_shows_the_way_to_the_goal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runs = run_demo("quadruped", "front left leg blocked", out=tmp_path)
+    (adapting,) = runs["with adaptation"]
+    assert adapting.success
+    assert np.linalg.norm(adapting.position[-1] - (2.5, 0.0)) < 0.5
+    assert "at the goal" in " ".join(capsys.readouterr().out.split())
+    with Image.open(tmp_path / "path.png") as plot, Image.open(tmp_path / "robot.gif") as film:
+        assert min(plot.size) > 100
+        assert film.n_frames >= adapting.steps
+
+
+@pytest.mark.parametrize(
+    ("robot", "wrong", "message"),
+    [
+        ("octopus", {}, "demo of reacher, ant, quadruped, minitaur, not of 'octopus'"),
+        ("ant", {"situation": "joint 9 dead"}, "joint"),
+        ("ant", {"breaks_at": (0, 900)}, r"within 1 episodes of 900 steps; got \(0, 900\)"),
+        ("ant", {"breaks_at": (1, 0)}, "breaks_at"),
+        ("quadruped", {"situation": "joint 99 locked"}, "joint"),
+        ("quadruped", {"env": {"profile": "dream"}}, "profile"),
+    ],
+)
+def test_mistakes_are_told_before_anything_runs(
+    tmp_path: Path, robot: str, wrong: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        run_demo(robot, out=tmp_path / "new", **wrong)
+    assert not (tmp_path / "new").exists()

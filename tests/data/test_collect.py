@@ -1,0 +1,221 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from famle_agent.data.collect import collect
+from famle_agent.data.policies import make_held_uniform
+from famle_agent.data.transitions import Transitions
+from tests.clock import HIGH, LOW, Clock, collected
+
+Array = npt.NDArray[Any]
+
+
+def assert_equal(one: Transitions, other: Transitions) -> None:
+    assert one.situations == other.situations
+    for name in ("obs", "action", "reward", "next_obs"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+# --- collecting -------------------------------------------------------------------------------------------
+
+
+def test_shapes_and_types() -> None:
+    counts: list[int] = []
+    data = collect([Clock(), Clock, Clock()], ["a", "b", "c"], 7, make_held_uniform(2), 0, counts.append)
+    assert data.obs.shape == data.next_obs.shape == (3, 7, 3)
+    assert data.action.shape == (3, 7, 2)
+    assert data.reward.shape == (3, 7)
+    assert {getattr(data, name).dtype for name in ("obs", "action", "reward", "next_obs")} == {np.dtype(np.float32)}
+    assert data.situations == ("a", "b", "c")
+    assert counts == [7, 7, 7]
+
+
+@pytest.mark.parametrize("terminates", [True, False])
+def test_no_transition_crosses_a_reset(terminates: bool) -> None:
+    data = collected(n=11, envs=[Clock(4, terminates)])
+    episode, step = data.obs[0, :, 0], data.obs[0, :, 1]
+    np.testing.assert_array_equal(data.next_obs[0, :, 0], episode)
+    np.testing.assert_array_equal(data.next_obs[0, :, 1], step + 1)
+    np.testing.assert_array_equal(data.reward[0], 10 * (step + 1))
+    np.testing.assert_array_equal(episode, np.arange(11) // 4)
+    inside = episode[1:] == episode[:-1]
+    np.testing.assert_array_equal(data.next_obs[0, :-1][inside], data.obs[0, 1:][inside])
+
+
+def test_seed_decides_everything() -> None:
+    one, same, other = collected(seed=0), collected(seed=0), collected(seed=1)
+    for name in ("obs", "action", "reward", "next_obs"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(same, name))
+    assert not np.array_equal(one.action, other.action)
+    assert not np.array_equal(one.obs, other.obs)  # the environments are seeded too
+    assert not np.array_equal(one.action[0], one.action[1])
+    assert not np.array_equal(one.obs[0], one.obs[1])
+
+
+def test_environments_are_seeded_once() -> None:
+    env = Clock()
+    collected(n=9, envs=[env])
+    assert [seed is None for seed in env.seeds] == [False, True, True]
+
+
+def test_environment_may_reuse_its_observation() -> None:
+    fresh, reused = collected(envs=[Clock()]), collected(envs=[Clock(reuses=True)])
+    np.testing.assert_array_equal(fresh.obs, reused.obs)
+    np.testing.assert_array_equal(fresh.next_obs, reused.next_obs)
+
+
+@given(st.integers(1, 6), st.integers(1, 7))
+def test_actions_are_held_and_drawn_anew_when_an_episode_begins(hold: int, length: int) -> None:
+    data = collected(n=20, hold=hold, envs=[Clock(length)])
+    step = data.obs[0, :, 1]
+    for i in range(1, 20):
+        redrawn = int(step[i]) % hold == 0  # an episode begins with step 0
+        assert np.array_equal(data.action[0, i], data.action[0, i - 1]) == (not redrawn)
+
+
+@given(st.integers(1, 9), st.integers(0, 9))
+def test_episode_ends_where_the_environment_or_its_length_ends_it(own: int, length: int) -> None:
+    data = collected(n=20, envs=[Clock(own)], episode_length=length)
+    shorter = min(own, length) if length else own
+    assert data.obs[0, :, 1].tolist() == [i % shorter for i in range(20)]
+    assert data.obs[0, :, 0].tolist() == [i // shorter for i in range(20)]
+
+
+def test_actions_fill_the_action_space() -> None:
+    action = collected(n=500, envs=[Clock()]).action[0]
+    assert (action >= LOW).all()
+    assert (action <= HIGH).all()
+    np.testing.assert_allclose(action.min(axis=0), LOW, atol=0.05)
+    np.testing.assert_allclose(action.max(axis=0), HIGH, atol=0.05)
+    np.testing.assert_allclose(action.mean(axis=0), (LOW + HIGH) / 2, atol=0.15)
+
+
+# --- who makes and who closes an environment ----------------------------------------------------------------
+
+
+class Counted(Clock):
+    """Remembers what happened to all of its kind."""
+
+    made: list[Counted]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.closed = False
+        self.made.append(self)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.fixture(autouse=True)
+def none_made() -> None:
+    Counted.made = []
+
+
+def test_what_is_made_here_is_closed_here_and_what_is_given_stays_open() -> None:
+    own = Counted()
+    collected(envs=[Counted, own, Counted])
+    assert [env is own or env.closed for env in Counted.made] == [True] * 3
+    assert not own.closed
+    assert sorted(len(env.seeds) for env in Counted.made) == [3, 3, 3]  # each was used once
+
+
+def test_environment_is_closed_where_its_policy_fails() -> None:
+    class FailingError(Exception):
+        pass
+
+    def fail(*_: Any) -> Any:
+        raise FailingError
+
+    with pytest.raises(FailingError):
+        collect([Counted], ["a"], 3, lambda env, situation, rng: fail, 0)
+    assert [env.closed for env in Counted.made] == [True]
+
+
+def test_factories_and_environments_collect_the_same_and_in_order() -> None:
+    assert_equal(collected(envs=[Clock(), Clock(), Clock()]), collected(envs=[Clock, Clock(), Clock]))
+
+
+def test_policy_knows_the_environment_and_its_situation() -> None:
+    envs, seen = [Clock(3), Clock(4)], []
+
+    def make_policy(env: Clock, situation: int, rng: np.random.Generator) -> Callable[[Array, bool], Array]:
+        seen.append((env, situation))
+        return lambda obs, episode_start: np.array([3.0, -5.0 if episode_start else -4.5], np.float32)
+
+    with pytest.raises(AssertionError):  # of the clock, that an action is none of its own
+        collect(envs, ["a", "b"], 5, lambda *_: lambda *_: np.zeros(2), 0)
+    data = collect(envs, ["a", "b"], 5, make_policy, 0)
+    assert seen == [(envs[0], 0), (envs[1], 1)]
+    np.testing.assert_array_equal(data.action[0, :, 1], [-5.0, -4.5, -4.5, -5.0, -4.5])
+    np.testing.assert_array_equal(data.action[1, :, 1], [-5.0, -4.5, -4.5, -4.5, -5.0])
+
+
+@pytest.mark.slow
+def test_processes_collect_what_one_would() -> None:
+    counts: list[int] = []
+    envs = [partial(Clock, 3), Clock(5), partial(Clock, 4)]
+    parallel = collected(n=12, envs=envs, n_jobs=2, callback=counts.append)
+    assert counts == [12, 12, 12]
+    assert_equal(parallel, collected(n=12, envs=[partial(Clock, 3), Clock(5), partial(Clock, 4)]))
+
+
+# --- a folder -----------------------------------------------------------------------------------------------
+
+
+def broken() -> Clock:
+    raise ConnectionError("the simulator is gone")
+
+
+def test_folder_keeps_what_was_collected_before_a_failure(tmp_path: Path) -> None:
+    folder = tmp_path / "deep" / "folder"
+    with pytest.raises(ConnectionError):
+        collected(envs=[Counted, broken, Counted], folder=folder)
+    assert [file.name for file in folder.iterdir()] == ["situation-000.npz"]
+    assert len(Counted.made) == 1
+    counts: list[int] = []
+    resumed = collected(envs=[broken, Counted, Counted], folder=folder, callback=counts.append)
+    assert len(Counted.made) == 3  # the first situation was not simulated again
+    assert counts == [9, 9, 9]
+    assert_equal(resumed, collected(envs=[Clock(), Clock(), Clock()]))
+    assert sorted(file.name for file in folder.iterdir()) == [f"situation-00{i}.npz" for i in range(3)]
+    assert_equal(collected(envs=[broken, broken, broken], folder=folder), resumed)
+
+
+def test_situation_that_stops_halfway_leaves_no_file(tmp_path: Path) -> None:
+    class Stops(Clock):
+        def step(self, action: Array) -> Any:
+            if self.clock == 2:
+                raise KeyboardInterrupt
+            return super().step(action)
+
+    with pytest.raises(KeyboardInterrupt):
+        collected(envs=[Stops()], folder=tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_folder_of_another_number_or_situation_is_refused(tmp_path: Path) -> None:
+    collected(n=9, folder=tmp_path)
+    with pytest.raises(
+        ValueError, match=r"9 transitions of 'situation 0' instead of 5.*Give another folder, or delete"
+    ):
+        collected(n=5, folder=tmp_path)
+    with pytest.raises(ValueError, match=r"of 'situation 0' instead of 9 of 'bent'.*Give another folder, or delete"):
+        collect([Clock(), Clock()], ["bent", "situation 1"], 9, make_held_uniform(1), 0, folder=tmp_path)
+
+
+def test_damaged_file_in_the_folder_is_named(tmp_path: Path) -> None:
+    collected(folder=tmp_path)
+    path = tmp_path / "situation-001.npz"
+    path.write_bytes(path.read_bytes()[:50])
+    with pytest.raises(ValueError, match=r"situation-001\.npz holds no transitions, or not all of them"):
+        collected(folder=tmp_path)

@@ -1,0 +1,168 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from famle_agent.models.dynamics import Batch, Dynamics, Theta, expand
+from famle_agent.models.gradient_steps import Anchor, InnerLoop
+
+OPTIMIZERS = ("sgd", "adam")
+
+
+def fresh_model() -> Dynamics:
+    torch.manual_seed(0)
+    return Dynamics(2, 1, n_situations=3, embedding_dim=2, hidden=(6,))
+
+
+def some_data(size: int, seed: int = 0) -> Batch:
+    generator = torch.Generator().manual_seed(seed)
+    x, y = torch.randn(size, 8, 3, generator=generator), torch.randn(size, 8, 2, generator=generator)
+    return Batch(x, y, torch.ones(size, 8))
+
+
+def start(model: Dynamics, size: int) -> tuple[Theta, torch.Tensor]:
+    return expand(model.parameters_by_name(), size), model.embeddings_of(torch.arange(size))
+
+
+@given(st.integers(0, 4), st.floats(0.0, 0.1), st.floats(0.0, 0.5))
+def test_steps_are_those_of_gradient_descent(steps: int, lr: float, embedding_lr: float) -> None:
+    model, data = fresh_model(), some_data(1)
+    theta, h, losses = InnerLoop(steps, lr, embedding_lr)(model, *start(model, 1), lambda: data)
+
+    theta_hand, h_hand = start(model, 1)
+    for step in range(steps):
+        leaves = {name: value.clone().requires_grad_() for name, value in theta_hand.items()}
+        h_leaf = h_hand.clone().requires_grad_()
+        error = model.forward(model.network(leaves, h_leaf), data.x) - data.y
+        loss = 0.5 * error.square().mean()
+        gradients = torch.autograd.grad(loss, [*leaves.values(), h_leaf])
+        theta_hand = {
+            name: value - lr * gradient for (name, value), gradient in zip(theta_hand.items(), gradients, strict=False)
+        }
+        h_hand = h_hand - embedding_lr * gradients[-1]
+        torch.testing.assert_close(losses[step, 0], loss.detach())
+    assert losses.shape == (steps, 1)
+    torch.testing.assert_close(h, h_hand)
+    for name, value in theta_hand.items():
+        torch.testing.assert_close(theta[name], value)
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_situations_do_not_influence_each_other(optimizer: str) -> None:
+    model, data = fresh_model(), some_data(3)
+    loop = InnerLoop(5, 0.05, 0.2, optimizer)
+    theta, h, losses = loop(model, *start(model, 3), lambda: data)
+    for i in range(3):
+        row = slice(i, i + 1)
+        alone = Batch(data.x[row], data.y[row], data.weight[row])
+        one, h_one, loss = loop(model, model.parameters_by_name(), model.embeddings[0, row], lambda b=alone: b)
+        torch.testing.assert_close(h[row], h_one)
+        torch.testing.assert_close(losses[:, row], loss)
+        for name, value in one.items():
+            torch.testing.assert_close(theta[name][row], value)
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_network_and_embedding_have_rates_of_their_own(optimizer: str) -> None:
+    model, data = fresh_model(), some_data(2)
+    theta, h = start(model, 2)
+    for lr, embedding_lr in ((0.0, 0.1), (0.1, 0.0)):
+        theta_tilde, h_tilde, _ = InnerLoop(3, lr, embedding_lr, optimizer)(model, theta, h, lambda: data)
+        assert torch.equal(h_tilde, h) == (embedding_lr == 0)
+        for name, value in theta.items():
+            assert torch.equal(theta_tilde[name], value) == (lr == 0), name
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_start_is_not_changed(optimizer: str) -> None:
+    model, data = fresh_model(), some_data(2)
+    theta, h = start(model, 2)
+    before, h_before = {name: value.clone() for name, value in theta.items()}, h.clone()
+    theta_tilde, h_tilde, _ = InnerLoop(2, 0.1, 0.1, optimizer)(model, theta, h, lambda: data)
+    assert torch.equal(h, h_before)
+    assert all(torch.equal(value, before[name]) for name, value in theta.items())
+    assert all(value.grad is None for value in model.parameters())
+    assert not h_tilde.requires_grad
+    assert not any(value.requires_grad for value in theta_tilde.values())
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_many_steps_lower_the_loss(optimizer: str) -> None:
+    model, data = fresh_model(), some_data(3)
+    _, _, losses = InnerLoop(100, 0.05, 0.1, optimizer)(model, *start(model, 3), lambda: data)
+    assert (losses[-1] < 0.9 * losses[0]).all()
+
+
+def test_each_step_draws_its_data() -> None:
+    model, drawn = fresh_model(), []
+
+    def sample() -> Batch:
+        drawn.append(some_data(1, seed=len(drawn)))
+        return drawn[-1]
+
+    _, _, losses = InnerLoop(3, 0.0, 0.0)(model, *start(model, 1), sample)
+    assert len(drawn) == 3
+    for loss, data in zip(losses, drawn, strict=True):
+        torch.testing.assert_close(loss, model.loss(*start(model, 1), data))
+
+
+@given(st.floats(0.0, 20.0), st.lists(st.integers(0, 30), min_size=2, max_size=2))
+def test_anchor_takes_a_step_back_by_a_part_of_the_way(decay: float, seen: list[int]) -> None:
+    model, data = fresh_model(), some_data(2)
+    theta, h = start(model, 2)
+    anchor = Anchor({name: value + 1.0 for name, value in theta.items()}, torch.tensor(seen))
+    free, h_free, _ = InnerLoop(1, 0.1, 0.2)(model, theta, h, lambda: data)
+    drawn, h_drawn, _ = InnerLoop(1, 0.1, 0.2, decay=decay)(model, theta, h, lambda: data, anchor)
+    assert torch.equal(h_drawn, h_free)
+    for i, n in enumerate(seen):
+        part = min(1.0, decay / max(n, 1))
+        for name, value in free.items():
+            torch.testing.assert_close(drawn[name][i], (1.0 - part) * value[i] + part * anchor.theta[name][i])
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_anchor_holds_the_more_the_less_was_seen(optimizer: str) -> None:
+    model, data = fresh_model(), some_data(1)
+    data = Batch(*(values.expand(4, *values.shape[1:]) for values in (data.x, data.y, data.weight)))
+    theta, h = start(model, 1)
+    theta, h = {name: value.expand(4, *value.shape[1:]) for name, value in theta.items()}, h.expand(4, -1)
+    anchor = Anchor(theta, torch.tensor([1.0, 10.0, 100.0, 1e9]))
+    far, *_ = InnerLoop(50, 0.01, 0.0, optimizer, decay=1.0)(model, theta, h, lambda: data, anchor)
+    way = sum((value - theta[name]).flatten(1).square().sum(dim=1) for name, value in far.items())
+    assert way[0] == 0.0
+    assert (way.diff() > 0.0).all()
+    free, *_ = InnerLoop(50, 0.01, 0.0, optimizer)(model, theta, h, lambda: data)
+    for name, value in free.items():
+        torch.testing.assert_close(far[name][3], value[3], rtol=1e-3, atol=1e-4)
+
+
+def test_a_decay_without_an_anchor_is_refused() -> None:
+    model, data = fresh_model(), some_data(1)
+    with pytest.raises(ValueError, match="give an anchor"):
+        InnerLoop(1, 0.1, 0.1, decay=1.0)(model, *start(model, 1), lambda: data)
+
+
+def test_gradients_are_found_where_they_are_switched_off() -> None:
+    model, data = fresh_model(), some_data(1)
+    with torch.no_grad():
+        theta, *_ = InnerLoop(1, 0.1, 0.1)(model, *start(model, 1), lambda: data)
+    assert not torch.equal(theta["weight_0"], start(model, 1)[0]["weight_0"])
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_members_of_an_ensemble_do_not_influence_each_other(optimizer: str) -> None:
+    torch.manual_seed(0)
+    model, data = Dynamics(2, 1, n_situations=3, embedding_dim=2, hidden=(6,), members=2), some_data(6)
+    loop, c = InnerLoop(5, 0.05, 0.2, optimizer), torch.arange(3)
+    theta, h, losses = loop(model, expand(model.parameters_by_name(), 3), model.embeddings_of(c), lambda: data)
+    for member in range(2):
+        alone = Dynamics(2, 1, n_situations=3, embedding_dim=2, hidden=(6,))
+        own = {name: value[member : member + 1] for name, value in model.parameters_by_name().items()}
+        batch = Batch(data.x[member::2], data.y[member::2], data.weight[member::2])
+        one, h_one, loss = loop(alone, expand(own, 3), model.embeddings[member], lambda b=batch: b)
+        torch.testing.assert_close(h[member::2], h_one)
+        torch.testing.assert_close(losses[:, member::2], loss)
+        for name, value in one.items():
+            torch.testing.assert_close(theta[name][member::2], value)
