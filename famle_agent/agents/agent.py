@@ -330,7 +330,7 @@ class ModelBasedAgent(SimulationLearner):
 
     def _load_pretrained(self, file: Traversable) -> None:
         with as_file(file) as path:
-            load_pretrained(self, path)
+            self._not_taken = load_pretrained(self, path)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ([] if self.dynamics is None else ["dynamics"]), []

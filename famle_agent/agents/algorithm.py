@@ -128,6 +128,7 @@ class ModelBasedAlgorithm(BaseAlgorithm):
         self._learned_reward: LearnedReward | None = None
         self._dims = self._dims_of(angle_dims, quaternion_dims, pose_dims)
         self._generator = torch.Generator(self.device)
+        self._not_taken: list[str] = []
         self._setup_model()
         if pretrained and robot.pretrained is not None:
             self._load_pretrained(robot.pretrained)
@@ -241,8 +242,11 @@ class ModelBasedAlgorithm(BaseAlgorithm):
 
     def _require_dynamics(self) -> Dynamics:
         if self.dynamics is None:
+            shipped = ""
+            if self._not_taken and "kind of agent" not in self._not_taken:
+                shipped = f" The model that is shipped has another {', '.join(self._not_taken)}."
             raise NotLearnedError(
-                f"This agent has no model yet. Call meta_learn() first, or {type(self).__name__}.load(path)."
+                f"This agent has no model yet.{shipped} Call meta_learn() first, or {type(self).__name__}.load(path)."
             )
         return self.dynamics
 

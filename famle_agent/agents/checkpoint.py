@@ -194,19 +194,23 @@ def restore_agent(agent: ModelBasedAgent, file: File) -> None:
         raise ValueError(f"{file} does not fit the agent's settings, or it is damaged: {error}") from error
 
 
-def load_pretrained(agent: ModelBasedAgent, file: File) -> None:
-    """Gives an agent the model of a stored one, if that is of the same kind, environment and settings of learning."""
+def load_pretrained(agent: ModelBasedAgent, file: File) -> list[str]:
+    """Gives an agent the model of a stored one, if that is of the same kind, environment and settings of learning.
+
+    Returns:
+        In what the two differ; nothing where the model was taken.
+    """
     meta, tensors = read_checkpoint(file)
-    alike = (
-        meta["class"] == type(agent).__name__
-        and all(tuple(meta.get(name, ())) == dims for name, dims in agent._dims.items())
-        and _world(meta["env"], agent) == _world(agent._env_spec, agent)
-        and Hyperparameters.from_dict(meta["hyperparameters"]).learnt_alike(agent.hyperparameters)
-    )
-    if alike:
+    differing = [] if meta["class"] == type(agent).__name__ else ["kind of agent"]
+    if _world(meta["env"], agent) != _world(agent._env_spec, agent):
+        differing.append("environment")
+    differing += [name for name, dims in agent._dims.items() if tuple(meta.get(name, ())) != dims]
+    differing += Hyperparameters.from_dict(meta["hyperparameters"]).learnt_otherwise(agent.hyperparameters)
+    if not differing:
         agent.situations = tuple(meta["situations"])
         weights = {name: value for name, value in tensors.items() if name.startswith(("dynamics/", "reward/"))}
         _restore_tensors(agent, weights, None)
+    return differing
 
 
 def _world(env: dict[str, Any] | None, agent: ModelBasedAgent) -> dict[str, Any] | None:

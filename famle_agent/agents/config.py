@@ -219,10 +219,10 @@ class Hyperparameters:
         """The settings as JSON types."""
         return dataclasses.asdict(self) | {"hidden": list(self.hidden)}
 
-    def learnt_alike(self, other: Hyperparameters) -> bool:
-        """Whether a model that was meta-learned with these settings is what the other ones would give."""
+    def learnt_otherwise(self, other: Hyperparameters) -> list[str]:
+        """Names the settings by which a model that was meta-learned with these differs from what the others give."""
         names = [field.name for field in dataclasses.fields(self) if field.name not in _ONLINE]
-        return all(getattr(self, name) == getattr(other, name) for name in names)
+        return [name for name in names if getattr(self, name) != getattr(other, name)]
 
     def iterations(self, rounds: int, last: bool = True) -> int:
         """Iterations of the learning to the end of a round, counted from 0, with Algorithm 1 if it is the last."""

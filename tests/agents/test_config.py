@@ -115,8 +115,9 @@ def test_joint_training_gets_its_settings() -> None:
     ],
 )
 def test_settings_of_the_life_on_a_robot_do_not_matter_for_what_was_learnt(change: dict[str, Any], alike: bool) -> None:
-    assert Hyperparameters().learnt_alike(Hyperparameters.from_dict(change)) == alike
-    assert Hyperparameters.from_dict(change).learnt_alike(Hyperparameters()) == alike
+    expected = [] if alike else [name for name in change if name != "horizon"]
+    assert Hyperparameters().learnt_otherwise(Hyperparameters.from_dict(change)) == expected
+    assert Hyperparameters.from_dict(change).learnt_otherwise(Hyperparameters()) == expected
 
 
 def test_adaptation_inherits_what_is_not_said_otherwise() -> None:

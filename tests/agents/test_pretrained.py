@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from famle_agent import FAMLE, Transitions
+from famle_agent import FAMLE, NotLearnedError, Transitions
 from famle_agent.agents.presets import Robot, known_robots
 from tests.conftest import SMALL
 
@@ -50,6 +51,9 @@ def test_shipped_agent_that_does_not_fit_is_left(shipped: Path, make_env: MakeEn
     agent = FAMLE(make_env(), device="cpu", seed=0, **SMALL | settings)
     assert agent.dynamics is None
     assert agent.situations == ()
+    reason = "" if "pretrained" in settings else f" The model that is shipped has another {next(iter(settings))}."
+    with pytest.raises(NotLearnedError, match=rf"no model yet\.{re.escape(reason)} Call meta_learn"):
+        agent.posterior()
 
 
 def test_shipped_agent_serves_another_goal(shipped: Path, make_env: MakeEnv) -> None:
