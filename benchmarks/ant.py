@@ -116,7 +116,7 @@ def untrained(seed: int) -> Situation:
 def with_members(task: Task, members: int) -> FAMLE:
     """The shipped agent with fewer members."""
     agent = famle(task)
-    agent.dynamics = agent._require_dynamics().with_members(members)
+    agent.dynamics = agent.model.with_members(members)
     return agent
 
 

@@ -52,7 +52,7 @@ def _as_famle_begins(task: Task) -> tuple[Dynamics, Tensor]:
     agent = shipped(task.robot, task.seed)
     agent.set_env(task.make())
     agent.learn(_IDENTIFIES)
-    return agent._require_dynamics(), agent.belief.h[:, None]
+    return agent.model, agent.belief.h[:, None]
 
 
 def _of_the_test_robot(agent: FAMLE, task: Task, n: int) -> Transitions:
@@ -61,7 +61,7 @@ def _of_the_test_robot(agent: FAMLE, task: Task, n: int) -> Transitions:
     planned = settings.rounds * settings.round_transitions
     planned = n * planned // (settings.transitions_per_situation + planned)
     random = collect(robot, name, n - planned, make_held_uniform(settings.action_hold), seed=0)
-    return random.followed_by(collect(robot, name, planned, agent._planning(), seed=1))
+    return random.followed_by(collect(robot, name, planned, agent.planning_policy(), seed=1))
 
 
 def _beside(some: Transitions, others: Transitions) -> Transitions:

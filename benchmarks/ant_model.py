@@ -57,7 +57,7 @@ class Args:
 
 def simulate(agent: FAMLE, situations: Sequence[Situation], n: int, walking: bool, seed: int, jobs: int) -> Transitions:
     """Held-out transitions: random actions, or the agent's own planning, which knows the situation."""
-    make_policy = agent._planning() if walking else make_held_uniform(agent.hyperparameters.action_hold)
+    make_policy = agent.planning_policy() if walking else make_held_uniform(agent.hyperparameters.action_hold)
     envs = [_Factory(situation) for situation in situations]
     return collect(envs, [str(situation) for situation in situations], n, make_policy, seed, n_jobs=jobs)
 
@@ -84,7 +84,7 @@ def accuracy(log_p: Tensor, candidates: Candidates, size: int) -> float:
 
 def identification(agent: FAMLE, data: Transitions, sizes: Sequence[int]) -> dict[str, dict[str, float]]:
     """Accuracy by window size, among the training situations and among their sums too."""
-    model = agent._require_dynamics()
+    model = agent.model
     batch = model.encode(*(torch.as_tensor(values) for values in (data.obs, data.action, data.next_obs)))
     result = {}
     for name, compose in (("training situations", False), ("sums too", True)):
@@ -127,7 +127,7 @@ def _towards(predicted: Tensor, true: Tensor, model: Dynamics) -> Tensor:
 @torch.no_grad()
 def learning_curve(agent: FAMLE, data: Transitions, seen: Sequence[int]) -> list[dict[str, Any]]:
     """Errors on later transitions by the number of first ones that were seen and by what is done with them."""
-    model, rows = agent._require_dynamics(), []
+    model, rows = agent.model, []
     ways = {
         "nearest embedding": (False, 0),
         "sums of embeddings": (True, 0),

@@ -190,7 +190,7 @@ class MetaTrained:
         """One agent whose robots have the networks of their replicates."""
         task, many = tasks[0], self.learn(tasks[0])
         agent = self._new(task)
-        agent.situations, agent.dynamics = many.situations, many._require_dynamics()
+        agent.situations, agent.dynamics = many.situations, many.model
         if not _is_shipped(task.robot):
             agent.dynamics = agent.dynamics.for_robots([task.seed % self.networks for task in tasks])
         agent.dynamics.to(agent.device)
@@ -230,7 +230,7 @@ def simulated_data(task: Task) -> Transitions:
         settings, transitions = agent.hyperparameters, agent.collect(progress_bar=True, n_jobs=-1)
         if n := settings.rounds * settings.round_transitions:
             envs = situation_envs(agent._require_env(), None)
-            planned = collect(envs.sources, envs.situations, n, agent._planning(), seed=1, n_jobs=-1)
+            planned = collect(envs.sources, envs.situations, n, agent.planning_policy(), seed=1, n_jobs=-1)
             transitions = transitions.followed_by(planned)
         path.parent.mkdir(parents=True, exist_ok=True)
         transitions.save(path)

@@ -56,7 +56,7 @@ def planning(agent: FAMLE, repeats: int) -> dict[str, float]:
     big = FAMLE("reacher", "paper", device="cpu", meta_iterations=1, inner_steps=1, transitions_per_situation=50)
     big.meta_learn()
     obs, _ = gym.make("FamleReacher-v0").reset(seed=0)
-    settings, model = big.hyperparameters, big._require_dynamics()
+    settings, model = big.hyperparameters, big.model
     sizes = [model.n_features + model.action_dim, *settings.hidden, model.obs_dim]
     x = [torch.randn(settings.candidates, size) for size in sizes[:-1]]
     weights = [torch.randn(a, b) for a, b in pairwise(sizes)]

@@ -68,7 +68,7 @@ class ModelBasedAgent(SimulationLearner):
         Raises:
             NotLearnedError: The agent has no model yet.
         """
-        model = self._require_dynamics()
+        model = self.model
         # A tensor counts how often it was written to: learning, loading and set_parameters change a model in place.
         known = model, model.embeddings._version, self.hyperparameters, self.seed
         if self._known_adapter is None or self._known_adapter[0] != known:
@@ -255,7 +255,7 @@ class ModelBasedAgent(SimulationLearner):
     @property
     def belief(self) -> Belief:
         """What the agent believes of its robots now; of one robot where it has seen none."""
-        return (self._live or self._state_of(self._require_dynamics().robots)).belief
+        return (self._live or self._state_of(self.model.robots)).belief
 
     @abstractmethod
     def posterior(self, state: OnlineState | None = None) -> dict[str, float]:
@@ -282,7 +282,7 @@ class ModelBasedAgent(SimulationLearner):
         """What the agent believes now where that fits the number of robots, else what it meta-learned."""
         if self._live is not None and self._live.robots == robots:
             return replace(self._live, last=None)
-        model = self._require_dynamics()
+        model = self.model
         M, W = self.hyperparameters.memory_size, self.hyperparameters.selection_window
         C = self.adapter.initial(robots).log_posterior.shape[1]
         return self.controller.init(Memory.empty(robots, M, model.obs_dim, model.action_dim, C, self.device, W))

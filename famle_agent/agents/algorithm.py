@@ -240,7 +240,13 @@ class ModelBasedAlgorithm(BaseAlgorithm):
             )
         return self.env
 
-    def _require_dynamics(self) -> Dynamics:
+    @property
+    def model(self) -> Dynamics:
+        """The meta-learned model.
+
+        Raises:
+            NotLearnedError: The agent has no model yet.
+        """
         if self.dynamics is None:
             shipped = ""
             if self._not_taken and "kind of agent" not in self._not_taken:

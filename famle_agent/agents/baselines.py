@@ -38,7 +38,7 @@ class _OneModelAgent(ModelBasedAgent):
 
     def posterior(self, state: OnlineState | None = None) -> dict[str, float]:
         """All the probability on the one model that there is."""
-        self._require_dynamics()
+        _ = self.model  # which an agent without one refuses
         return {_EVERY_SITUATION: 1.0}
 
     def marginals(self, state: OnlineState | None = None) -> dict[str, float]:

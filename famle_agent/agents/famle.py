@@ -43,7 +43,7 @@ class FAMLE(ModelBasedAgent):
         return self.hyperparameters.reptile()
 
     def _log_model(self) -> None:
-        log_embeddings(self.logger, self._require_dynamics().embeddings[0], self.situations, self.num_timesteps)
+        log_embeddings(self.logger, self.model.embeddings[0], self.situations, self.num_timesteps)
 
     def _new_adapter(self, model: Dynamics) -> EmbeddingAdapter:
         return EmbeddingAdapter(model, self.hyperparameters.on_the_robot(), self.seed or 0)

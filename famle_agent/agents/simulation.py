@@ -192,13 +192,13 @@ class SimulationLearner(ModelBasedAlgorithm):
         if number == 0:
             n, make_policy = settings.transitions_per_situation, make_held_uniform(settings.action_hold)
         else:
-            n, make_policy = settings.round_transitions, self._planning()
+            n, make_policy = settings.round_transitions, self.planning_policy()
         seed, length = self._draw_seed(), settings.episode_length
         return collect(envs.sources, envs.situations, n, make_policy, seed, callback, n_jobs, folder, length)
 
-    def _planning(self) -> MakePolicy:
-        """What makes the agent plan with what it has learnt so far."""
-        model, reward_fn = deepcopy(self._require_dynamics()).cpu(), self._reward_fn
+    def planning_policy(self) -> MakePolicy:
+        """Makes a policy that plans with what the agent has learnt so far, and knows which situation it is in."""
+        model, reward_fn = deepcopy(self.model).cpu(), self._reward_fn
         if reward_fn is None and self._learned_reward is not None:
             learned, scale = (
                 deepcopy(self._learned_reward).cpu(),
@@ -258,5 +258,5 @@ class SimulationLearner(ModelBasedAlgorithm):
         if new:
             self.dynamics = self._new_dynamics()
             self.dynamics.fit_normalisation(obs, action, next_obs)
-        model = self._require_dynamics()
+        model = self.model
         return model, model.encode(obs, action, next_obs)

@@ -73,7 +73,7 @@ def memory(agent: FAMLE) -> Memory:
 @pytest.mark.parametrize("keep_adapting", [True, False])
 def test_belief_is_judged_by_what_it_has_not_seen(load: Load, data: Transitions, keep_adapting: bool) -> None:
     agent = load(keep_adapting=keep_adapting)
-    model = agent._require_dynamics()
+    model = agent.model
     for i in range(8):
         before: Belief = agent._state_of(1).belief
         tell(agent, data, [DEAD], range(i, i + 1))
@@ -103,7 +103,7 @@ def after_each_adaptation(
 
 def test_steps_go_on_as_long_as_no_embedding_is_better(load: Load, data: Transitions) -> None:
     agent = load()
-    model, steps = agent._require_dynamics(), agent.hyperparameters.adaptation(0)
+    model, steps = agent.model, agent.hyperparameters.adaptation(0)
     tell(agent, data, [STRANGE], range(30))
     seen = memory(agent).seen
     adaptations = 0
@@ -119,7 +119,7 @@ def test_steps_go_on_as_long_as_no_embedding_is_better(load: Load, data: Transit
 
 def test_agent_begins_anew_where_the_situation_changes(load: Load, data: Transitions) -> None:
     agent = load()
-    model, steps = agent._require_dynamics(), agent.hyperparameters.adaptation(0)
+    model, steps = agent.model, agent.hyperparameters.adaptation(0)
     tell(agent, data, [STRANGE], range(30))
     assert memory(agent).seen > WINDOW
     began = 0
@@ -138,7 +138,7 @@ def test_agent_begins_anew_where_the_situation_changes(load: Load, data: Transit
 def imagined(agent: FAMLE, belief: Belief, data: Transitions) -> Tensor:
     """What a planner with a belief expects of some actions."""
     obs, action = (torch.as_tensor(values[DEAD, :20])[None] for values in (data.obs, data.action))
-    return agent._require_dynamics().simulator(belief.theta, belief.h)(obs, action)
+    return agent.model.simulator(belief.theta, belief.h)(obs, action)
 
 
 def planned_with(agent: FAMLE, data: Transitions) -> Tensor:
@@ -157,7 +157,7 @@ def test_adapted_model_plans_where_no_embedding_is_better(load: Load, data: Tran
 def test_embedding_alone_plans_while_steps_lead_astray_and_nothing_is_forgotten(load: Load, data: Transitions) -> None:
     agent = load(adapt_lr=0.3)
     tell(agent, data, [DEAD], range(30))
-    selected = select(agent._require_dynamics(), agent.candidates, agent.belief)
+    selected = select(agent.model, agent.candidates, agent.belief)
     assert better_explained(memory(agent), selected.candidate).all()
     assert selected.candidate.tolist() == agent.belief.candidate.tolist() == [DEAD]
     assert memory(agent).seen > 2 * WINDOW

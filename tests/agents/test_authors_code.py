@@ -148,7 +148,7 @@ def test_wrapper_tells_of_it_at_the_reset(load: Load) -> None:
 
 def test_first_episode_is_lived_with_what_was_meta_learned(load: Load, data: Transitions) -> None:
     agent = load()
-    model = agent._require_dynamics()
+    model = agent.model
     for i in range(EPISODE):
         agent.observe(data.obs[3, i], data.action[3, i], data.next_obs[3, i])
         belief = agent.belief
@@ -224,7 +224,7 @@ def two_robots(agent: FAMLE, data: Transitions, steps: int, ends: dict[int, list
 def test_only_the_robot_whose_episode_ended_adapts(load: Load, data: Transitions, ended: int) -> None:
     agent, other = load(robots=2), 1 - ended
     state = two_robots(agent, data, 5, {4: [robot == ended for robot in range(2)]})
-    belief, model = state.belief, agent._require_dynamics()
+    belief, model = state.belief, agent.model
     assert torch.equal(belief.h[other], model.embeddings[0, 0])
     assert not torch.equal(belief.h[ended], model.embeddings[0, 0])
     for name, value in belief.theta.items():
@@ -255,7 +255,7 @@ def test_predictions_are_bounded_from_the_first_adaptation_on(data: Transitions,
     for i in range(EPISODE):
         agent.observe(data.obs[two, i], data.action[two, i], data.next_obs[two, i])
         state = agent._state_of(2)
-        free = agent._require_dynamics().simulator(state.belief.theta, state.belief.h)(far, action)
+        free = agent.model.simulator(state.belief.theta, state.belief.h)(far, action)
         assert torch.equal(agent.adapter.model_for(state.belief, state.memory)(far, action), free)
     agent.begin_episode()
     state = agent._state_of(2)

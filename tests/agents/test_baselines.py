@@ -228,7 +228,7 @@ def test_same_seed_same_agent(data: Transitions, kind: str) -> None:
 def test_members_of_an_ensemble_adapt_and_plan_together(data: Transitions, make_env: MakeEnv, kind: str) -> None:
     env = make_env(max_episode_steps=5)
     agent = make(kind, env, members=3, meta_iterations=2 * (kind != "ampc")).meta_learn(data)
-    assert agent._require_dynamics().members == 3
+    assert agent.model.members == 3
     assert len(theta_of(agent)) == 3
     state = run(agent, env, steps=6)
     assert len(state.belief.h) == 3
@@ -266,7 +266,7 @@ def test_file_of_another_kind_of_agent_is_refused(make_env: MakeEnv, right: Any,
 @every_kind
 def test_the_one_embedding_stays_as_it_is(load: Load, data: Transitions, kind: str) -> None:
     agent = load(kind)
-    embeddings = agent._require_dynamics().embeddings
+    embeddings = agent.model.embeddings
     assert embeddings.shape == (1, 1, 1)
     tell(agent, data, 4)
     assert torch.equal(agent.belief.h, embeddings[:, 0])
@@ -275,7 +275,7 @@ def test_the_one_embedding_stays_as_it_is(load: Load, data: Transitions, kind: s
 def test_rival_that_knows_nothing_is_a_random_network_in_the_units_of_the_simulation(
     data: Transitions, unseen: Transitions, make_env: MakeEnv
 ) -> None:
-    one, other = (make("ampc", make_env(), members=2).meta_learn(given)._require_dynamics() for given in (data, unseen))
+    one, other = (make("ampc", make_env(), members=2).meta_learn(given).model for given in (data, unseen))
     obs, next_obs = torch.from_numpy(data.obs), torch.from_numpy(data.next_obs)
     torch.testing.assert_close(one.input_mean, one.features(obs).mean(dim=(0, 1)), rtol=1e-4, atol=1e-5)
     deviation = one.targets(obs, next_obs).flatten(0, 1).std(dim=0)
@@ -289,7 +289,7 @@ def test_rival_that_knows_nothing_is_a_random_network_in_the_units_of_the_simula
 def encoded(agent: ModelBasedAgent, transitions: Transitions, rows: slice) -> Batch:
     """Some transitions of each situation as the agent's model sees them."""
     columns = (transitions.obs, transitions.action, transitions.next_obs)
-    return agent._require_dynamics().encode(*(torch.from_numpy(values[:, rows]) for values in columns))
+    return agent.model.encode(*(torch.from_numpy(values[:, rows]) for values in columns))
 
 
 @pytest.mark.parametrize("kind", ["reptile", "first-order-maml", "maml"])
@@ -297,7 +297,7 @@ def test_meta_learning_prepares_for_the_steps_on_the_robot(load: Load, unseen: T
     losses, rule = [], load(kind).hyperparameters.inner_loop()
     for name in (kind, "ampc"):
         agent = load(name)
-        model, support, query = agent._require_dynamics(), *(encoded(agent, unseen, half) for half in HALVES)
+        model, support, query = agent.model, *(encoded(agent, unseen, half) for half in HALVES)
         theta, h = expand(model.parameters_by_name(), 11), model.embeddings_of(torch.arange(11))
         theta, h, _ = rule(model, theta, h, lambda data=support: data)
         losses.append(model.loss(theta, h, query).mean().item())
@@ -309,7 +309,7 @@ def test_rival_learns_on_the_robots_from_scratch(load: Load, data: Transitions) 
     later = encoded(agent, data, slice(45, 60))
     for i in range(45):
         agent.observe(data.obs[:, i], data.action[:, i], data.next_obs[:, i])
-        losses.append(agent._require_dynamics().loss(agent.belief.theta, agent.belief.h, later).mean().item())
+        losses.append(agent.model.loss(agent.belief.theta, agent.belief.h, later).mean().item())
     assert losses[-1] < 0.75 * losses[0]
 
 
@@ -346,5 +346,5 @@ def test_rounds_of_planning_in_simulation_need_no_embeddings(make_env: MakeEnv, 
     for agent in agents:
         agent.meta_learn(["intact", "joint 0 reversed"], folder=tmp_path)
         assert agent.situations == ("intact", "joint 0 reversed")
-    one, stored = (agent._require_dynamics().state_dict() for agent in agents)
+    one, stored = (agent.model.state_dict() for agent in agents)
     assert all(torch.equal(value, stored[name]) for name, value in one.items())

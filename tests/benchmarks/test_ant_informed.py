@@ -38,7 +38,7 @@ def collected(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 def test_informed_ant_knows_the_test_robot_alone(collected: list[Any], tmp_path: Path) -> None:
     agent = ant_informed.informed(Task("ant", 0, BROKEN, tmp_path))
-    model, before = agent._require_dynamics(), shipped("ant", 0)._require_dynamics()
+    model, before = agent.model, shipped("ant", 0).model
     assert agent.situations == (BROKEN.label,)
     assert model.n_situations == 1
     assert collected == [(BROKEN, 20), (BROKEN, 10)]
@@ -51,4 +51,4 @@ def test_informed_ant_knows_the_test_robot_alone(collected: list[Any], tmp_path:
 def test_informed_ant_learns_once(collected: list[Any], tmp_path: Path) -> None:
     first, again = (ant_informed.informed(Task("ant", 0, BROKEN, tmp_path)) for _ in range(2))
     assert len(collected) == 2
-    assert torch.equal(first._require_dynamics().embeddings, again._require_dynamics().embeddings)
+    assert torch.equal(first.model.embeddings, again.model.embeddings)

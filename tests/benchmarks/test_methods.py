@@ -97,7 +97,7 @@ def test_methods_differ_by_their_settings(method: str, expected: dict[str, Any],
     assert isinstance(agent, ModelBasedAgent)
     settings = agent.hyperparameters
     assert {name: getattr(settings, name) for name in expected} == expected
-    assert settings.members == agent._require_dynamics().members == 1
+    assert settings.members == agent.model.members == 1
     agent.get_env().close()
 
 
@@ -219,7 +219,7 @@ def test_replicates_share_one_network_where_one_is_shipped(monkeypatch: pytest.M
     monkeypatch.setattr(methods, "_is_shipped", lambda robot: True)
     recipe = MetaTrained("alone", AMPC)
     one, other = (recipe.agent(task_of(seed, tmp_path)) for seed in (0, 1))
-    assert one._require_dynamics().members == 1
+    assert one.model.members == 1
     assert torch.equal(network_of(one), network_of(other))
 
 

@@ -199,7 +199,7 @@ def test_reward_that_is_learned_judges_the_plans_of_a_round() -> None:
     settings = TINY | {"rounds": 0, "candidates": 40, "planner": "random_shooting"}
     agent = FAMLE("Pendulum-v1", device="cpu", seed=0, **settings)
     agent.meta_learn([lambda g=g: gym.make("Pendulum-v1", g=g) for g in (3.0, 10.0)])
-    policy = agent._planning()(agent.get_env().envs[0], 0, np.random.default_rng(0))
+    policy = agent.planning_policy()(agent.get_env().envs[0], 0, np.random.default_rng(0))
     seen: list[torch.Tensor] = []
     original = type(agent._learned_reward).forward
 
