@@ -259,6 +259,8 @@ META_TRAINED: dict[str, MetaTrained] = {
     "famle-original": MetaTrained("original", FAMLE, "original", 10, simulation={"candidates": ORIGINAL_CANDIDATES}),
     "ampc": MetaTrained("ampc", AMPC, networks=30),
     "ampc-paper": MetaTrained("paper-ampc", AMPC, "paper", 30),
+    "ampc-original": MetaTrained("original-ampc", AMPC, "original", 30),
+    "ampc-reptile-original": MetaTrained("original-reptile", AMPCMAML, "original", 10, MAML["reptile"]),
     **{f"ampc-{rival}": MetaTrained(rival, AMPCMAML, settings=settings) for rival, settings in MAML.items()},
     **{
         f"ampc-{rival}-{name}": MetaTrained(f"{name}-{rival}", AMPCMAML, "paper", n, {**settings, **changed})

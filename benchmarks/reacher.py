@@ -26,7 +26,7 @@ MODEL_BASED = (
     *("famle", "ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml"),
     *("famle-paper", "ampc-paper", "ampc-reptile-paper", "ampc-fomaml-paper", "ampc-maml-paper"),
     *("famle-paper-held", "ampc-reptile-paper-held", "ampc-fomaml-paper-held", "ampc-maml-paper-held"),
-    "famle-original",
+    *("famle-original", "ampc-original", "ampc-reptile-original"),
 )
 
 

@@ -17,7 +17,8 @@ __all__ = ["headline", "insert"]
 
 METHODS = (
     *("famle", "ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml", "ppo", "ppo-pretrained", "informed", "oracle"),
-    *("famle-paper", "ampc-paper", "ampc-reptile-paper", "ampc-fomaml-paper", "ampc-maml-paper", "famle-original"),
+    *("famle-paper", "ampc-paper", "ampc-reptile-paper", "ampc-fomaml-paper", "ampc-maml-paper"),
+    *("famle-original", "ampc-original", "ampc-reptile-original"),
 )
 """What the table has rows for, where it was measured."""
 

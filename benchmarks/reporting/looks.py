@@ -48,6 +48,10 @@ LOOKS: Mapping[str, Look] = {
     "without-embeddings": Look("without embeddings, two rounds of ten", "#b8860b"),
     "ampc": Look("AMPC", "#8c510a", paper="AMPC"),
     "ampc-reptile": Look("AMPC-MAML (Reptile)", "#e69f00", paper="AMPC-MAML"),
+    "ampc-original": Look("AMPC, the authors' code's settings", "#8c510a", "--", paper="AMPC"),
+    "ampc-reptile-original": Look(
+        "AMPC-MAML (Reptile), the authors' code's settings", "#e69f00", "--", paper="AMPC-MAML"
+    ),
     "ampc-paper": Look("AMPC, the paper's settings", "#8c510a", "-.", paper="AMPC"),
     "ampc-reptile-paper": Look("AMPC-MAML (Reptile), the paper's settings", "#e69f00", "-.", paper="AMPC-MAML"),
     "ampc-fomaml-paper": Look("AMPC-MAML (first order), the paper's settings", "#f0675c", "-.", paper="AMPC-MAML"),

@@ -23,7 +23,15 @@ pytestmark = pytest.mark.usefixtures("small_reacher")
 KINDS: dict[str, type[BaseAlgorithm]] = {
     **{name: FAMLE for name in METHODS if name.startswith("famle")},
     **{name: AMPCMAML for name in METHODS if name.startswith("ampc-")},
-    **{"ampc": AMPC, "ampc-paper": AMPC, "ppo": PPO, "ppo-pretrained": PPO, "oracle": FAMLE, "one-simulator": FAMLE},
+    **{
+        "ampc": AMPC,
+        "ampc-paper": AMPC,
+        "ampc-original": AMPC,
+        "ppo": PPO,
+        "ppo-pretrained": PPO,
+        "oracle": FAMLE,
+        "one-simulator": FAMLE,
+    },
 }
 IN_STEP = tuple(META_TRAINED)
 
