@@ -187,7 +187,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     ),
     Experiment(
         folder="ant-curves",
-        title="Ant, unseen damage over many episodes (figure 4)",
+        title="Ant, unseen damage over many episodes (figure 4; the authors' planned data with 64 sequences of 10,000)",
         kind="curves",
         command="python -m benchmarks.ant --experiment curves --replicates 10",
         shared=_ANT_AND_INFORMED,

@@ -11,7 +11,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from benchmarks import curves, methods, reacher
-from benchmarks.methods import META_TRAINED, METHODS, PPO_METHODS, MetaTrained, about
+from benchmarks.methods import META_TRAINED, METHODS, ORIGINAL_CANDIDATES, PPO_METHODS, MetaTrained, about
+from benchmarks.reporting.registry import experiment_in
 from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent
 from famle_agent.agents import simulation
 from famle_agent.agents.presets import known_robots
@@ -263,3 +264,7 @@ def test_network_may_be_learnt_with_another_planner_than_it_is_used_with(tmp_pat
     recipe = MetaTrained("planned", FAMLE, "paper", simulation={"candidates": 3})
     assert recipe.learn(task_of(0, tmp_path)).hyperparameters.candidates == 3
     assert recipe.agent(task_of(0, tmp_path)).hyperparameters.candidates == REDUCED["candidates"]
+
+
+def test_title_says_what_the_planned_data_of_the_authors_settings_were_planned_with() -> None:
+    assert f"planned data with {ORIGINAL_CANDIDATES} sequences" in experiment_in("ant-curves").title
