@@ -22,7 +22,6 @@ from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent, Transitions
 from famle_agent.agents.checkpoint import load_pretrained
 from famle_agent.agents.presets import known_robots
 from famle_agent.data.collect import collect
-from famle_agent.data.envs import situation_envs
 from famle_agent.data.policies import make_held_uniform
 
 __all__ = [
@@ -133,7 +132,7 @@ def oracle(task: Task) -> FAMLE:
             lambda agent: agent.meta_learn(collect([task.make], [task.situation.label], 2000, hold, seed=0)),
         )
     probe = FAMLE(task.robot, device="cpu", pretrained=False)
-    situations = len(probe._require_env().get_attr("training_situations")[0])
+    situations = len(probe.situation_envs().situations)
     n = situations * probe.hyperparameters.transitions_per_situation
     agent = FAMLE(task.robot, seed=task.seed, device="cpu", pretrained=False, transitions_per_situation=n)
     return from_cache(agent, path, lambda agent: agent.meta_learn([task.situation]))
@@ -229,7 +228,7 @@ def simulated_data(task: Task) -> Transitions:
         agent = FAMLE(task.robot, seed=0, device="cpu")
         settings, transitions = agent.hyperparameters, agent.collect(progress_bar=True, n_jobs=-1)
         if n := settings.rounds * settings.round_transitions:
-            envs = situation_envs(agent._require_env(), None)
+            envs = agent.situation_envs()
             planned = collect(envs.sources, envs.situations, n, agent.planning_policy(), seed=1, n_jobs=-1)
             transitions = transitions.followed_by(planned)
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -92,7 +92,7 @@ class SimulationLearner(ModelBasedAlgorithm):
             ValueError: There are no situations, an environment's spaces differ from the agent's, or the folder is of a
                 run with other settings.
         """
-        source = envs if isinstance(envs, Transitions) else self._situation_envs(envs)
+        source = envs if isinstance(envs, Transitions) else self.situation_envs(envs)
         rounds = 0 if isinstance(source, Transitions) else self.hyperparameters.rounds
         run = RunFolder(folder, {} if folder is None else self._fingerprint(source))  # which reads all transitions
         if not self._custom_logger:
@@ -175,12 +175,13 @@ class SimulationLearner(ModelBasedAlgorithm):
         self, envs: Sequence[EnvLike] | None = None, progress_bar: bool = False, n_jobs: int = 1
     ) -> Transitions:
         """Collects the random transitions that :meth:`meta_learn` learns from; arguments as there."""
-        source = self._situation_envs(envs)
+        source = self.situation_envs(envs)
         n = self.hyperparameters.transitions_per_situation * len(source.sources)
         with tqdm(total=n, desc="Simulating", unit="step", mininterval=1.0, disable=not progress_bar) as bar:
             return self._simulate(source, 0, n_jobs, None, bar.update)
 
-    def _situation_envs(self, envs: Sequence[EnvLike] | None) -> SituationEnvs:
+    def situation_envs(self, envs: Sequence[EnvLike] | None = None) -> SituationEnvs:
+        """Makes or takes one environment per training situation; arguments and errors as of :meth:`meta_learn`."""
         return situation_envs(self._require_env(), envs, self.hyperparameters.episode_length)
 
     def _simulate(
