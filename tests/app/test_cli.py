@@ -112,7 +112,9 @@ def test_help_names_the_commands(capsys: pytest.CaptureFixture[str]) -> None:
         assert command in shown
 
 
-@pytest.mark.parametrize("command", [["famle"], [sys.executable, "-m", "famle_agent"]])
+@pytest.mark.parametrize(
+    "command", [[str(Path(sys.executable).with_name("famle"))], [sys.executable, "-m", "famle_agent"]]
+)
 def test_version_from_the_command_line(command: list[str]) -> None:
     shown = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
     assert shown.stdout.strip() == f"famle {famle_agent.__version__}"

@@ -64,7 +64,7 @@ def test_demo_shows_the_ant_before_at_and_after_the_break(tmp_path: Path, capsys
     assert adapting.situations[119] == "intact"
     assert adapting.situations[-1] == "joint 2 dead + yaw sensor off by 60 deg"
     assert set(frozen.situations) == {"intact"}
-    assert "before the break" in " ".join(capsys.readouterr().out.split())
+    assert "speed.png" in capsys.readouterr().out
     with Image.open(tmp_path / "speed.png") as plot, Image.open(tmp_path / "robot.gif") as film:
         assert min(plot.size) > 100
         assert film.n_frames > 20

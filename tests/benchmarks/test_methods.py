@@ -184,8 +184,9 @@ def test_replicates_take_turns_with_the_networks_of_one_ensemble(
 
 @pytest.mark.parametrize("method", IN_STEP)
 def test_replicates_of_a_method_have_networks_of_their_own(method: str, cache: Path) -> None:
-    agents = [METHODS[method].agent(task_of(seed, cache)) for seed in range(10)]
-    assert len({tuple(network_of(agent)[0].tolist()) for agent in agents}) == 10
+    networks = META_TRAINED[method].networks
+    agents = [METHODS[method].agent(task_of(seed, cache)) for seed in range(networks + 1)]
+    assert len({tuple(network_of(agent)[0].tolist()) for agent in agents}) == networks  # and then they take turns
 
 
 def test_rivals_learn_from_the_same_transitions(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -252,7 +252,7 @@ def test_interrupted_simulation_goes_on_to_the_same_agent(
 ) -> None:
     """Stopped in the first round of planning, in its second situation."""
     agent = make_agent()
-    planning = agent._planning
+    planning = agent.planning_policy
 
     def stops() -> Any:
         make = planning()
@@ -264,7 +264,7 @@ def test_interrupted_simulation_goes_on_to_the_same_agent(
 
         return make_policy
 
-    monkeypatch.setattr(agent, "_planning", stops)
+    monkeypatch.setattr(agent, "planning_policy", stops)
     with pytest.raises(KeyboardInterrupt):
         agent.meta_learn(SITUATIONS, folder=tmp_path)
     assert [file.name for file in (tmp_path / "round-1").iterdir()] == ["situation-000.npz"]
