@@ -107,8 +107,8 @@ _ANT_AND_INFORMED = (
 _LEGS = f"{_ONE_MODEL}; legs take turns."
 _ARM = (
     "Replicates of FAMLE and of the oracle have their own data and their own meta-training. The other model-based "
-    "agents share their simulated data and take turns with ten networks, AMPC and the paper's settings with thirty; a "
-    "PPO that is trained in simulation first is one policy for all. "
+    "agents share their simulated data and take turns with ten networks, on held actions with five, AMPC with thirty; "
+    "a PPO that is trained in simulation first is one policy for all. "
 )
 _NO_SUCCESS = Published("AMPC", success=0.0)
 _ARM_PAPER = (
