@@ -18,7 +18,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from benchmarks.harness import commit, write_whole
 from famle_agent import ModelBasedAgent
-from famle_agent.agents.checkpoint import restore_agent
 
 __all__ = ["History", "Repeatable", "read_life", "write_life"]
 
@@ -104,7 +103,7 @@ def read_life(path: Path, agent: BaseAlgorithm) -> History | None:
             return None
         saved, history = io.BytesIO(archive.read(_AGENT)), History(**json.loads(archive.read(_HISTORY)))
     if isinstance(agent, ModelBasedAgent):
-        restore_agent(agent, saved)
+        agent.restore(saved)
     else:
         agent.set_parameters(saved, device=agent.device)  # type: ignore[arg-type]
         agent.set_random_seed((agent.seed or 0) + history.steps)

@@ -19,7 +19,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from benchmarks import ppo
 from benchmarks.task import Task
 from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent, Transitions
-from famle_agent.agents.checkpoint import load_pretrained
 from famle_agent.agents.presets import known_robots
 from famle_agent.data.collect import collect
 from famle_agent.data.policies import make_held_uniform
@@ -92,7 +91,7 @@ def from_cache(agent: Agent, path: Path, learn: Callable[[Agent], object] = lamb
     How it adapts and plans is the agent's own: a model outlasts a change of these settings.
     """
     if path.exists():
-        load_pretrained(agent, path)
+        agent.take_model(path)
     if agent.dynamics is None:
         learn(agent)
         agent.save(path)

@@ -7,7 +7,6 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import as_file
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,10 +20,12 @@ from typing_extensions import Self
 from famle_agent.adaptation.belief import Belief
 from famle_agent.adaptation.controller import Adapter, Controller, OnlineState
 from famle_agent.adaptation.memory import Memory
-from famle_agent.agents.checkpoint import File, load_agent, load_pretrained, restore_agent, save_agent
+from famle_agent.agents.checkpoint import Checkpoint, File
+from famle_agent.agents.presets import make_env
 from famle_agent.agents.simulation import SimulationLearner
 from famle_agent.agents.tensorboard import log_adaptations, log_posterior
 from famle_agent.data.action_scaling import check_action, check_observation, to_action_space
+from famle_agent.data.envs import env_attribute
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import prepare_torch
 from famle_agent.planning import Planner, RewardFn
@@ -298,7 +299,32 @@ class ModelBasedAgent(SimulationLearner):
         Args:
             path: A path, ``.zip`` is appended where it has no suffix; or a binary file.
         """
-        save_agent(self, path)
+        if not hasattr(self, "observation_space"):
+            raise ValueError("This agent has no environment, so that there is nothing to save; make it with one.")
+        live = self._live
+        parts: dict[str, dict[str, Tensor]] = {
+            "dynamics": {} if self.dynamics is None else self.dynamics.state_dict(),
+            "reward": {} if self._learned_reward is None else self._learned_reward.state_dict(),
+            "live": {} if live is None else live.to_tensors(),
+            # The state of another device's generator means nothing elsewhere.
+            "generator": {"state": self._generator.get_state()} if self.device.type == "cpu" else {},
+        }
+        Checkpoint(
+            kind=type(self).__name__,
+            mode=self.mode,
+            hyperparameters=self.hyperparameters,
+            observation_space=self.observation_space,
+            action_space=self.action_space,
+            dims=self.dims,
+            situations=self.situations,
+            env=self._env_spec,
+            needs_reward_fn=self._reward_fn is not None,
+            seed=self.seed,
+            num_timesteps=self.num_timesteps,
+            episodes=self._episode_num,
+            live=None if live is None else live.counts,
+            tensors={f"{part}/{name}": value for part, values in parts.items() for name, value in values.items()},
+        ).write(path)
 
     @classmethod
     def load(  # type: ignore[override]
@@ -323,14 +349,108 @@ class ModelBasedAgent(SimulationLearner):
             ValueError: The file is damaged, foreign or another kind of agent; the environment does not fit; a
                 ``reward_fn`` is needed.
         """
-        return load_agent(cls, path, env, device=device, reward_fn=reward_fn, **overrides)
+        if "mode" in overrides:
+            raise ValueError(
+                "A stored agent has all its settings, and no other mode; give load() the settings to change."
+            )
+        stored = Checkpoint.read(path)
+        if stored.kind != cls.__name__:
+            raise ValueError(
+                f"The file is no FAMLE checkpoint of {cls.__name__} but of {stored.kind}; load it with "
+                f"{stored.kind}.load()."
+            )
+        if stored.needs_reward_fn and reward_fn is None:
+            raise ValueError(
+                "The agent was made with a reward_fn, which no file can hold: give load(..., reward_fn=...)."
+            )
+        if (made := stored.make_env() if env is None else make_env(env)) is not None:
+            _check_same_spaces(made, stored)
+        # All settings are in the file, so that its mode need not be known for this environment.
+        settings = {**stored.hyperparameters.to_dict(), **stored.dims, **overrides}
+        agent = cls(made, reward_fn=reward_fn, device=device, pretrained=False, **settings)
+        agent.mode, agent.num_timesteps, agent._episode_num = stored.mode, stored.num_timesteps, stored.episodes
+        if made is None:
+            agent.observation_space, agent.action_space = stored.observation_space, stored.action_space
+            agent.n_envs = 1
+        agent.set_random_seed(stored.seed)
+        agent._take_over(stored)
+        agent.set_random_seed(overrides.get("seed"))
+        return agent
 
-    def _restore(self, file: Path) -> None:
-        restore_agent(self, file)
+    def restore(self, file: File) -> None:
+        """Takes weights, belief and random numbers from the file of an agent with the same settings.
+
+        Args:
+            file: A path or a binary file.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: The file is damaged, or its weights are of other settings.
+        """
+        self._take_over(Checkpoint.read(file))
+
+    def take_model(self, file: File) -> list[str]:
+        """Takes the model from a file, if that is of the same kind, environment and settings of learning.
+
+        Args:
+            file: A path or a binary file.
+
+        Returns:
+            In what the two differ; nothing where the model was taken.
+        """
+        stored = Checkpoint.read(file)
+        differing = [] if stored.kind == type(self).__name__ else ["kind of agent"]
+        if self._world(stored.env) != self._world(self._env_spec):
+            differing.append("environment")
+        differing += [name for name, dims in self.dims.items() if stored.dims[name] != dims]
+        differing += stored.hyperparameters.learnt_otherwise(self.hyperparameters)
+        if not differing:
+            self.situations = stored.situations
+            self._take_weights(stored)
+        return differing
+
+    def _take_over(self, stored: Checkpoint) -> None:
+        self.situations = stored.situations
+        try:
+            self._take_weights(stored)
+            if stored.live is not None:
+                self._live = self._online_state(stored, stored.live)
+            if self.device.type == "cpu" and (generator := stored.part("generator")):
+                self._generator.set_state(generator["state"])
+        except (KeyError, RuntimeError, TypeError) as error:
+            raise ValueError(
+                "The file's weights do not fit the agent's settings; it is damaged, or an override changed the network: "
+                f"{error}"
+            ) from error
+
+    def _take_weights(self, stored: Checkpoint) -> None:
+        if weights := stored.part("dynamics"):
+            robots = max(1, len(weights["embeddings"]) // self.hyperparameters.members)
+            self.dynamics = self._new_dynamics(robots)
+            self.dynamics.load_state_dict(weights)
+        if weights := stored.part("reward"):
+            self._learned_reward = self._new_reward()
+            self._learned_reward.load_state_dict(weights)
+
+    def _online_state(self, stored: Checkpoint, counts: dict[str, int]) -> OnlineState | None:
+        settings = self.hyperparameters
+        tensors = {name: value.to(self.device) for name, value in stored.part("live").items()}
+        state = OnlineState.from_tensors(tensors, **counts)
+        state = state.resized(settings.memory_size, settings.selection_window, settings.horizon)
+        # With other candidates than the stored agent's, what it has seen cannot be judged by what it knew of them.
+        begins = self.adapter.initial(state.robots)
+        return state if state.belief.log_posterior.shape == begins.log_posterior.shape else None
+
+    def _world(self, env: dict[str, Any] | None) -> dict[str, Any] | None:
+        """What of an environment's description matters to a model of all its situations."""
+        if env is None or self.env is None:
+            return None
+        other = env_attribute(self.env, "task_arguments", ())
+        return {"id": env["id"], "kwargs": {key: value for key, value in env["kwargs"].items() if key not in other}}
 
     def _load_pretrained(self, file: Traversable) -> None:
         with as_file(file) as path:
-            self._not_taken = load_pretrained(self, path)
+            self._not_taken = self.take_model(path)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ([] if self.dynamics is None else ["dynamics"]), []
@@ -347,6 +467,14 @@ class ModelBasedAgent(SimulationLearner):
     def _to_env(self, action: Tensor) -> Array:
         """From [-1, 1] to the action space."""
         return to_action_space(action, self.action_space)
+
+
+def _check_same_spaces(env: Any, stored: Checkpoint) -> None:
+    if env.observation_space != stored.observation_space or env.action_space != stored.action_space:
+        raise ValueError(
+            f"The environment's spaces, {env.observation_space} and {env.action_space}, are not the agent's, "
+            f"{stored.observation_space} and {stored.action_space}."
+        )
 
 
 def _before_reset(obs: Any, dones: Array, infos: Sequence[Mapping[str, Any]]) -> Array:

@@ -71,6 +71,7 @@ class ModelBasedAlgorithm(BaseAlgorithm):
     Attributes:
         dynamics: The meta-learned model; None before :meth:`meta_learn`, where none is shipped.
         situations: What the training situations are called, in the order of the model's embeddings.
+        dims: The special dimensions of an observation: ``angle_dims``, ``quaternion_dims`` and ``pose_dims``.
 
     Raises:
         TypeError: An override is no setting.
@@ -126,7 +127,7 @@ class ModelBasedAlgorithm(BaseAlgorithm):
         if self.env is not None:
             self._take_reward(self.env)
         self._learned_reward: LearnedReward | None = None
-        self._dims = self._dims_of(angle_dims, quaternion_dims, pose_dims)
+        self.dims = self._dims_of(angle_dims, quaternion_dims, pose_dims)
         self._generator = torch.Generator(self.device)
         self._not_taken: list[str] = []
         self._setup_model()
@@ -210,7 +211,7 @@ class ModelBasedAlgorithm(BaseAlgorithm):
             self._n_embeddings,
             settings.embedding_dim,
             settings.hidden,
-            **self._dims,
+            **self.dims,
             gate_actions=settings.gate_actions,
             interaction_rank=settings.interaction_rank,
             members=settings.members,
@@ -223,7 +224,7 @@ class ModelBasedAlgorithm(BaseAlgorithm):
         ).to(self.device)
 
     def _new_reward(self) -> LearnedReward:
-        layout = ObservationLayout(self.observation_space.shape[0], **self._dims)
+        layout = ObservationLayout(self.observation_space.shape[0], **self.dims)
         return LearnedReward(layout, self.action_space.shape[0]).to(self.device)
 
     def _known_reward_fn(self) -> RewardFn | None:

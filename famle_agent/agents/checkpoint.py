@@ -7,37 +7,24 @@ import json
 import os
 import zipfile
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO
 
 import gymnasium as gym
 import numpy as np
-import torch
 from gymnasium import spaces
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from famle_agent.adaptation.controller import OnlineState
 from famle_agent.agents.config import Hyperparameters
-from famle_agent.agents.presets import known_robots, make_env
-from famle_agent.data.envs import env_attribute
+from famle_agent.agents.presets import known_robots
 from famle_agent.models.observation import DIMS
 from famle_agent.utils.atomic_write import whole_file
 
-if TYPE_CHECKING:
-    from famle_agent.agents.agent import ModelBasedAgent
-
-__all__ = [
-    "File",
-    "load_agent",
-    "load_pretrained",
-    "read_checkpoint",
-    "restore_agent",
-    "save_agent",
-    "write_checkpoint",
-]
+__all__ = ["Checkpoint", "File", "read_checkpoint", "write_checkpoint"]
 
 _FORMAT = "famle-agent"
 _VERSION = 2
@@ -47,7 +34,6 @@ _DAMAGE = (
 )
 _META, _TENSORS = "agent.json", "tensors.safetensors"
 
-Agent = TypeVar("Agent", bound="ModelBasedAgent")
 File = str | os.PathLike[str] | BinaryIO
 
 
@@ -99,170 +85,116 @@ def read_checkpoint(file: File) -> tuple[dict[str, Any], dict[str, Tensor]]:
     return meta, tensors
 
 
-def save_agent(agent: ModelBasedAgent, file: File) -> None:
-    """Writes all that an agent is: see :meth:`ModelBasedAgent.save`."""
-    if not hasattr(agent, "observation_space"):
-        raise ValueError("This agent has no environment, so that there is nothing to save; make it with one.")
-    live = agent._live
-    meta = {
-        "class": type(agent).__name__,
-        "mode": agent.mode,
-        "hyperparameters": agent.hyperparameters.to_dict(),
-        "observation_space": _box_to_json(agent.observation_space),
-        "action_space": _box_to_json(agent.action_space),
-        **{name: list(dims) for name, dims in agent._dims.items()},
-        "situations": list(agent.situations),
-        "env": agent._env_spec,
-        "needs_reward_fn": agent._reward_fn is not None,
-        "seed": agent.seed,
-        "num_timesteps": agent.num_timesteps,
-        "episodes": agent._episode_num,
-        "live": None if live is None else live.counts,
-    }
-    parts: dict[str, dict[str, Tensor]] = {
-        "dynamics": {} if agent.dynamics is None else agent.dynamics.state_dict(),
-        "reward": {} if agent._learned_reward is None else agent._learned_reward.state_dict(),
-        "live": {} if live is None else live.to_tensors(),
-        # The state of another device's generator means nothing elsewhere.
-        "generator": {"state": agent._generator.get_state()} if agent.device.type == "cpu" else {},
-    }
-    tensors = {f"{part}/{name}": value for part, values in parts.items() for name, value in values.items()}
-    write_checkpoint(file, meta, tensors)
+@dataclass(frozen=True)
+class Checkpoint:
+    """All that a stored agent is.
 
-
-def load_agent(
-    cls: type[Agent], file: File, env: Any, *, reward_fn: Any, device: torch.device | str, **overrides: Any
-) -> Agent:
-    """Makes an agent from a file: see :meth:`ModelBasedAgent.load`."""
-    if "mode" in overrides:
-        raise ValueError("A stored agent has all its settings, and no other mode; give load() the settings to change.")
-    meta, tensors = read_checkpoint(file)
-    if (kind := meta.get("class")) != cls.__name__:
-        raise ValueError(
-            f"The file is no FAMLE checkpoint of {cls.__name__} but of {kind}; load it with {kind}.load()."
-        )
-    try:
-        observation_space, action_space = (_box_from_json(meta[f"{name}_space"]) for name in ("observation", "action"))
-        situations = tuple(str(name) for name in list(meta["situations"]))
-        settings = Hyperparameters.from_dict(meta["hyperparameters"]).to_dict()
-        mode, seed, live = meta["mode"], meta["seed"], meta["live"]
-        num_timesteps, episodes = int(meta.get("num_timesteps", 0)), int(meta.get("episodes", 0))
-        if not any(mode in robot.modes for robot in known_robots().values()):
-            raise ValueError(f"no robot has a mode {mode!r}")
-        dims = {name: tuple(meta.get(name, ())) for name in DIMS}
-        needs_reward_fn, named_env = meta["needs_reward_fn"], meta["env"]
-        env = _named_env(named_env) if env is None else env
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"The file's description of the agent is damaged or of another version ({error!r}). Save the agent again; "
-            "if it is the environment that cannot be made, give load(..., env=...)."
-        ) from error
-    if needs_reward_fn and reward_fn is None:
-        raise ValueError("The agent was made with a reward_fn, which no file can hold: give load(..., reward_fn=...).")
-    if env is not None:
-        env = make_env(env)
-        _check_env(env, observation_space, action_space)
-    # All settings are in the file, so that its mode need not be known for this environment.
-    agent = cls(env, reward_fn=reward_fn, device=device, pretrained=False, **{**settings, **dims, **overrides})
-    agent.mode, agent.situations = mode, situations
-    agent.num_timesteps, agent._episode_num = num_timesteps, episodes
-    if env is None:
-        agent.observation_space, agent.action_space, agent.n_envs = observation_space, action_space, 1
-    agent.set_random_seed(seed)
-    try:
-        _restore_tensors(agent, tensors, live)
-    except (KeyError, RuntimeError, TypeError) as error:
-        raise ValueError(
-            f"The file's weights do not fit its settings; it is damaged, or an override changed the network: {error}"
-        ) from error
-    agent.set_random_seed(overrides.get("seed"))
-    return agent
-
-
-def restore_agent(agent: ModelBasedAgent, file: File) -> None:
-    """Gives an agent the weights, the belief and the random numbers of a stored agent with the same settings.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file is damaged, or its weights are of other settings.
+    Attributes:
+        kind: The name of its class.
+        mode: Its mode.
+        hyperparameters: All its settings.
+        observation_space: Of its robot.
+        action_space: Of its robot.
+        dims: The special dimensions of an observation by name.
+        situations: The names of the training situations.
+        env: Id and arguments of its environment; None where that cannot be named.
+        needs_reward_fn: Whether it was made with a ``reward_fn``, which no file can hold.
+        seed: Its seed.
+        num_timesteps: Steps that it has lived on robots.
+        episodes: Episodes that it has lived on robots.
+        live: The counts of its online state; None where it has none.
+        tensors: Its weights, its online state and its random numbers, as "part/name".
     """
-    meta, tensors = read_checkpoint(file)
-    try:
-        agent.situations = tuple(str(name) for name in meta["situations"])
-        _restore_tensors(agent, tensors, meta["live"])
-    except (KeyError, RuntimeError, TypeError) as error:
-        raise ValueError(f"{file} does not fit the agent's settings, or it is damaged: {error}") from error
 
+    kind: str
+    mode: str
+    hyperparameters: Hyperparameters
+    observation_space: spaces.Box
+    action_space: spaces.Box
+    dims: dict[str, tuple[int, ...]]
+    situations: tuple[str, ...]
+    env: dict[str, Any] | None
+    needs_reward_fn: bool
+    seed: int | None
+    num_timesteps: int
+    episodes: int
+    live: dict[str, int] | None
+    tensors: dict[str, Tensor]
 
-def load_pretrained(agent: ModelBasedAgent, file: File) -> list[str]:
-    """Gives an agent the model of a stored one, if that is of the same kind, environment and settings of learning.
+    def write(self, file: File) -> None:
+        """Writes the file, see :func:`write_checkpoint`."""
+        meta = {
+            "class": self.kind,
+            "mode": self.mode,
+            "hyperparameters": self.hyperparameters.to_dict(),
+            "observation_space": _box_to_json(self.observation_space),
+            "action_space": _box_to_json(self.action_space),
+            **{name: list(dims) for name, dims in self.dims.items()},
+            "situations": list(self.situations),
+            "env": self.env,
+            "needs_reward_fn": self.needs_reward_fn,
+            "seed": self.seed,
+            "num_timesteps": self.num_timesteps,
+            "episodes": self.episodes,
+            "live": self.live,
+        }
+        write_checkpoint(file, meta, self.tensors)
 
-    Returns:
-        In what the two differ; nothing where the model was taken.
-    """
-    meta, tensors = read_checkpoint(file)
-    differing = [] if meta["class"] == type(agent).__name__ else ["kind of agent"]
-    if _world(meta["env"], agent) != _world(agent._env_spec, agent):
-        differing.append("environment")
-    differing += [name for name, dims in agent._dims.items() if tuple(meta.get(name, ())) != dims]
-    differing += Hyperparameters.from_dict(meta["hyperparameters"]).learnt_otherwise(agent.hyperparameters)
-    if not differing:
-        agent.situations = tuple(meta["situations"])
-        weights = {name: value for name, value in tensors.items() if name.startswith(("dynamics/", "reward/"))}
-        _restore_tensors(agent, weights, None)
-    return differing
+    @classmethod
+    def read(cls, file: File) -> Checkpoint:
+        """Reads a file.
 
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: The file is damaged, foreign or of another version.
+        """
+        meta, tensors = read_checkpoint(file)
+        try:
+            if not any(meta["mode"] in robot.modes for robot in known_robots().values()):
+                raise ValueError(f"no robot has a mode {meta['mode']!r}")
+            return cls(
+                kind=str(meta["class"]),
+                mode=meta["mode"],
+                hyperparameters=Hyperparameters.from_dict(meta["hyperparameters"]),
+                observation_space=_box_from_json(meta["observation_space"]),
+                action_space=_box_from_json(meta["action_space"]),
+                dims={name: tuple(meta.get(name, ())) for name in DIMS},
+                situations=tuple(str(name) for name in list(meta["situations"])),
+                env=meta["env"],
+                needs_reward_fn=meta["needs_reward_fn"],
+                seed=meta["seed"],
+                num_timesteps=int(meta.get("num_timesteps", 0)),
+                episodes=int(meta.get("episodes", 0)),
+                live=meta["live"],
+                tensors=tensors,
+            )
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"The file is no FAMLE checkpoint that this package knows: its description of the agent is damaged or "
+                f"of another version ({error!r}). Save the agent again."
+            ) from error
 
-def _world(env: dict[str, Any] | None, agent: ModelBasedAgent) -> dict[str, Any] | None:
-    """What of an environment's description matters to a model of all its situations."""
-    if env is None or agent.env is None:
-        return None
-    other = env_attribute(agent.env, "task_arguments", ())
-    kwargs = {key: value for key, value in env["kwargs"].items() if key not in other}
-    return {"id": env["id"], "kwargs": kwargs}
-
-
-def _named_env(named: dict[str, Any] | None) -> gym.Env[Any, Any] | None:
-    """The environment that a file names, if it is one of ours: another one's arguments might run anything."""
-    if named is None or named["id"] not in gym.registry:
-        return None
-    entry_point = gym.registry[named["id"]].entry_point
-    if not isinstance(entry_point, str) or not entry_point.startswith("famle_envs."):
-        return None
-    return gym.make(named["id"], max_episode_steps=named.get("max_episode_steps"), **named["kwargs"])
-
-
-def _check_env(env: Any, observation_space: spaces.Box, action_space: spaces.Box) -> None:
-    if env.observation_space != observation_space or env.action_space != action_space:
-        raise ValueError(
-            f"The environment's spaces, {env.observation_space} and {env.action_space}, are not the agent's, "
-            f"{observation_space} and {action_space}."
-        )
-
-
-def _restore_tensors(agent: ModelBasedAgent, tensors: dict[str, Tensor], live: dict[str, int] | None) -> None:
-    def part(name: str) -> dict[str, Tensor]:
+    def part(self, name: str) -> dict[str, Tensor]:
+        """The tensors of one part of the agent, by name; empty where it has none."""
         prefix = f"{name}/"
-        return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+        return {key.removeprefix(prefix): value for key, value in self.tensors.items() if key.startswith(prefix)}
 
-    if weights := part("dynamics"):
-        robots = max(1, len(weights["embeddings"]) // agent.hyperparameters.members)
-        agent.dynamics = agent._new_dynamics(robots)
-        agent.dynamics.load_state_dict(weights)
-    if weights := part("reward"):
-        agent._learned_reward = agent._new_reward()
-        agent._learned_reward.load_state_dict(weights)
-    if live is not None:
-        state = {name: value.to(agent.device) for name, value in part("live").items()}
-        settings = agent.hyperparameters
-        stored = OnlineState.from_tensors(state, **live)
-        stored = stored.resized(settings.memory_size, settings.selection_window, settings.horizon)
-        # With other candidates than the stored agent's, what it has seen cannot be judged by what it knew of them.
-        begins = agent.adapter.initial(stored.robots)
-        comparable = stored.belief.log_posterior.shape == begins.log_posterior.shape
-        agent._live = stored if comparable else None
-    if agent.device.type == "cpu" and "generator/state" in tensors:
-        agent._generator.set_state(tensors["generator/state"])
+    def make_env(self) -> gym.Env[Any, Any] | None:
+        """Makes the environment that the file names, if it is one of ours: another one's arguments might run anything.
+
+        Raises:
+            ValueError: It cannot be made.
+        """
+        try:
+            if self.env is None or self.env["id"] not in gym.registry:
+                return None
+            name, limit, kwargs = self.env["id"], self.env.get("max_episode_steps"), self.env["kwargs"]
+            entry_point = gym.registry[name].entry_point
+            if not isinstance(entry_point, str) or not entry_point.startswith("famle_envs."):
+                return None
+            return gym.make(name, max_episode_steps=limit, **kwargs)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"The file's environment cannot be made ({error!r}); give load(..., env=...).") from error
 
 
 def _box_to_json(space: spaces.Box) -> dict[str, Any]:

@@ -52,7 +52,7 @@ class SimulationLearner(ModelBasedAlgorithm):
         """Returns to what was meta-learned, as for a robot that was just repaired."""
 
     @abstractmethod
-    def _restore(self, file: Path) -> None:
+    def restore(self, file: Path) -> None:
         """Takes over the model of a stored agent, and where its random numbers had got to."""
 
     def _log_model(self) -> None:
@@ -142,7 +142,7 @@ class SimulationLearner(ModelBasedAlgorithm):
             new = self._in_model_units(new)
             transitions = new if transitions is None else transitions.followed_by(new)
             if (agent := folder.finished(number)) is not None:
-                self._restore(agent)
+                self.restore(agent)
                 self.num_timesteps = settings.iterations(number, last)
                 continue
 
@@ -217,7 +217,7 @@ class SimulationLearner(ModelBasedAlgorithm):
         return {
             "agent": type(self).__name__,
             "env": self._env_spec,
-            "dimensions": {name: list(dims) for name, dims in self._dims.items()},
+            "dimensions": {name: list(dims) for name, dims in self.dims.items()},
             "needs_reward_fn": self._reward_fn is not None,
             "seed": self.seed,
             "situations": list(source.situations),

@@ -235,7 +235,7 @@ def test_quaternions_survive() -> None:
     )
     agent.meta_learn(["intact", "joint 3 dead", "joint 4 dead"])
     loaded = FAMLE.load(saved(agent), device="cpu")
-    assert loaded._dims["quaternion_dims"] == (1, 2, 3, 4)
+    assert loaded.dims["quaternion_dims"] == (1, 2, 3, 4)
     assert loaded.dynamics.layout.quaternion_dims == (1, 2, 3, 4)
     obs, _ = env.reset(seed=0)
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], agent.predict(obs, deterministic=True)[0])

@@ -141,18 +141,18 @@ def test_environment_reward_is_used(make_env: MakeEnv) -> None:
 
 
 def test_angles_are_those_of_the_environment_or_of_the_user(make_env: MakeEnv) -> None:
-    assert FAMLE(make_env(), device="cpu")._dims["angle_dims"] == (0, 1, 2, 3, 4)
-    assert FAMLE(make_env(), device="cpu", angle_dims=(1,))._dims["angle_dims"] == (1,)
-    assert FAMLE("Pendulum-v1", device="cpu")._dims["angle_dims"] == ()
+    assert FAMLE(make_env(), device="cpu").dims["angle_dims"] == (0, 1, 2, 3, 4)
+    assert FAMLE(make_env(), device="cpu", angle_dims=(1,)).dims["angle_dims"] == (1,)
+    assert FAMLE("Pendulum-v1", device="cpu").dims["angle_dims"] == ()
 
 
 def test_quaternions_are_those_of_the_environment_or_of_the_user(make_env: MakeEnv) -> None:
     ant = make_env("FamleAnt-v0")
-    assert FAMLE(ant, device="cpu", pretrained=False)._dims["quaternion_dims"] == (1, 2, 3, 4)
+    assert FAMLE(ant, device="cpu", pretrained=False).dims["quaternion_dims"] == (1, 2, 3, 4)
     own = FAMLE(ant, device="cpu", pretrained=False, quaternion_dims=())
-    assert own._dims["quaternion_dims"] == ()
+    assert own.dims["quaternion_dims"] == ()
     assert own._new_dynamics().n_features == 27
-    assert FAMLE(make_env(), device="cpu")._dims["quaternion_dims"] == ()
+    assert FAMLE(make_env(), device="cpu").dims["quaternion_dims"] == ()
     turned = FAMLE(make_env(), device="cpu", angle_dims=(0,), quaternion_dims=(4, 3, 2, 1))
     assert turned._new_dynamics().n_features == 7 + 2 + 10
 

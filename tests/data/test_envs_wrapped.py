@@ -30,7 +30,7 @@ def test_what_is_said_of_other_observations_is_not_taken(make_env: MakeEnv, wrap
     with pytest.raises(ValueError, match=r"angle_dims.*Observation.*angle_dims=\.\.\."):
         FAMLE(env, device="cpu", reward_fn=first)
     agent = FAMLE(env, device="cpu", angle_dims=(), reward_fn=first)
-    assert agent._dims["angle_dims"] == ()
+    assert agent.dims["angle_dims"] == ()
 
 
 def test_stacked_observations_are_others(make_env: MakeEnv) -> None:
@@ -44,7 +44,7 @@ def test_rescaled_actions_leave_observations_as_they_are(make_env: MakeEnv) -> N
     with pytest.raises(ValueError, match="RescaleAction"):
         FAMLE(env, device="cpu")
     agent = FAMLE(env, device="cpu", reward_fn=first)
-    assert agent._dims["angle_dims"] == FAMLE("reacher", device="cpu")._dims["angle_dims"]
+    assert agent.dims["angle_dims"] == FAMLE("reacher", device="cpu").dims["angle_dims"]
 
 
 def test_wrapper_that_looks_on_costs_nothing(make_env: MakeEnv) -> None:

@@ -210,16 +210,16 @@ def test_learned_reward_sees_where_the_robot_is() -> None:
 )
 def test_dimensions_are_those_of_the_environment_or_of_the_user(robot: str, expected: tuple[Any, ...]) -> None:
     agent = FAMLE(robot, device="cpu", pretrained=False)
-    assert agent._dims == dict(zip(DIMS, expected, strict=True))
+    assert agent.dims == dict(zip(DIMS, expected, strict=True))
     own = {"angle_dims": (), "quaternion_dims": (), "pose_dims": (3, 1, 0)}
-    assert FAMLE(agent.get_env(), device="cpu", pretrained=False, **own)._dims == own
+    assert FAMLE(agent.get_env(), device="cpu", pretrained=False, **own).dims == own
     agent.get_env().close()
 
 
 @pytest.mark.parametrize("robot", ["FamleQuadruped-v0", "FamleMinitaur-v0"])
 def test_model_of_the_paper_knows_nothing_of_poses(robot: str) -> None:
     agent = FAMLE(robot, "paper", device="cpu")
-    assert agent._dims["pose_dims"] == ()
+    assert agent.dims["pose_dims"] == ()
     agent.get_env().close()
 
 
