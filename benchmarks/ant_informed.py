@@ -40,8 +40,8 @@ def _learn_on(agent: FAMLE, task: Task) -> None:
     own = _of_the_test_robot(agent, task, others.obs.shape[1])
 
     agent.dynamics = _with_embeddings(model, torch.cat([model.embeddings.detach(), h], dim=1))
-    known, data = agent._begin_model(agent._in_model_units(_beside(others, own)), new=False)
-    for _ in agent.hyperparameters.joint_training(1).steps(known, data, agent._generator):
+    known, data = agent.begin_model(agent.in_model_units(_beside(others, own)), new=False)
+    for _ in agent.hyperparameters.joint_training(1).steps(known, data, agent.generator):
         pass
     known.fit_noise(data)
     agent.dynamics = _with_embeddings(known, known.embeddings.detach()[:, -1:])

@@ -59,9 +59,9 @@ def environment(repeats: int) -> dict[str, float]:
         start = time.perf_counter()
         robot.step(action)
         step.append(time.perf_counter() - start)
-        twin._actuate(action)  # type: ignore[attr-defined]
+        twin.actuate(action)  # type: ignore[attr-defined]
         start = time.perf_counter()
-        pybullet.stepSimulation(physicsClientId=twin._client)  # type: ignore[attr-defined]
+        pybullet.stepSimulation(physicsClientId=twin.client)  # type: ignore[attr-defined]
         bare.append(time.perf_counter() - start)
     robot.close()
     twin.close()

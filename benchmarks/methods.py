@@ -100,7 +100,7 @@ def from_cache(agent: Agent, path: Path, learn: Callable[[Agent], object] = lamb
 
 def famle(task: Task, **overrides: Any) -> FAMLE:
     """FAMLE with the model that the package ships, or where it ships none a model of the replicate's own."""
-    if _is_shipped(task.robot):
+    if is_shipped(task.robot):
         return shipped(task.robot, task.seed, **overrides)
     agent = FAMLE(task.robot, seed=task.seed, device=task.device, **overrides)
     return from_cache(agent, task.cache / f"{task.robot}-ours-{task.seed}.zip")
@@ -189,7 +189,7 @@ class MetaTrained:
         task, many = tasks[0], self.learn(tasks[0])
         agent = self._new(task)
         agent.situations, agent.dynamics = many.situations, many.model
-        if not _is_shipped(task.robot):
+        if not is_shipped(task.robot):
             agent.dynamics = agent.dynamics.for_robots([task.seed % self.networks for task in tasks])
         agent.dynamics.to(agent.device)
         return agent
@@ -199,7 +199,7 @@ class MetaTrained:
 
         Learning that is stopped goes on from a folder beside the cached file, if it is asked for again.
         """
-        members = {} if _is_shipped(task.robot) else {"members": self.networks}
+        members = {} if is_shipped(task.robot) else {"members": self.networks}
         agent = self._new(replace(task, seed=0, device="cpu"), **self.simulation, **members)
         path = task.cache / f"{task.robot}-{self.name}.zip"
         on_its_way = path.with_suffix("")
@@ -287,5 +287,5 @@ PPO_METHODS = ("ppo", "ppo-pretrained")
 """Those that need many more steps than the others."""
 
 
-def _is_shipped(robot: str) -> bool:
+def is_shipped(robot: str) -> bool:
     return known_robots()[robot].pretrained is not None

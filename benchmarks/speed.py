@@ -91,7 +91,7 @@ def environment(repeats: int) -> dict[str, float]:
 
     def bare() -> None:
         for _ in range(robot.physics_steps):  # type: ignore[attr-defined]
-            pybullet.stepSimulation(physicsClientId=robot._client)  # type: ignore[attr-defined]
+            pybullet.stepSimulation(physicsClientId=robot.client)  # type: ignore[attr-defined]
 
     step, raw = in_turn(repeats * 10, lambda: robot.step(action), bare)
     env.close()

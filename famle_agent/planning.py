@@ -133,7 +133,7 @@ class ICEM(Planner):
         elites = start[:, None]  # the last plan competes
         keep = max(1, int(self.keep_fraction * self.elites))
         for _ in range(self.iterations):
-            noise = _coloured_noise(start, self.candidates, self.noise_beta, generator)
+            noise = coloured_noise(start, self.candidates, self.noise_beta, generator)
             tau = (mean[:, None] + std[:, None] * noise).clamp(-1.0, 1.0)
             tau = torch.cat([tau, elites[:, :keep], mean[:, None]], dim=1)
 
@@ -164,7 +164,7 @@ class MPPI(Planner):
         """See :meth:`Planner.plan`."""
         mean = start
         for _ in range(self.iterations):
-            noise = self.init_std * _coloured_noise(start, self.candidates, self.noise_beta, generator)
+            noise = self.init_std * coloured_noise(start, self.candidates, self.noise_beta, generator)
             tau = torch.cat([mean[:, None], (mean[:, None] + noise).clamp(-1.0, 1.0)], dim=1)
             returns = judge(tau)
             best = returns.amax(dim=1, keepdim=True)
@@ -186,7 +186,7 @@ def _take(tau: Tensor, index: Tensor) -> Tensor:
     return tau.gather(1, index[..., None, None].expand(-1, -1, *tau.shape[2:]))
 
 
-def _coloured_noise(like: Tensor, n: int, beta: float, generator: torch.Generator) -> Tensor:
+def coloured_noise(like: Tensor, n: int, beta: float, generator: torch.Generator) -> Tensor:
     """Gaussian noise (B, n, H, action_dim) of unit variance with the power spectrum 1 / f^beta along H.
 
     Timmer and Koenig (1995): white noise in the frequency domain, scaled by f^(-beta / 2).

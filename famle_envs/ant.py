@@ -179,30 +179,32 @@ class AntEnv(BulletEnv):
     def _perturb_start(self) -> None:
         noise = self.np_random.uniform(-_START_NOISE, _START_NOISE, N_JOINTS)
         for joint, angle in zip(self.joints, (noise + _START_ANGLES).tolist(), strict=True):
-            pybullet.resetJointState(self._robot, joint, angle, physicsClientId=self._world)
+            pybullet.resetJointState(self.robot, joint, angle, physicsClientId=self._world)
 
     def _apply_situation(self) -> None:
         super()._apply_situation()
         # A joint has a motor of its own, which brakes it from the start, or holds it where it was locked before.
         pybullet.setJointMotorControlArray(
-            self._robot, self.joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * N_JOINTS, physicsClientId=self._world
+            self.robot, self.joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * N_JOINTS, physicsClientId=self._world
         )
         self._torque = MAX_TORQUE * np.array(self._situation.motor_gain)
         pybullet.changeDynamics(
             self._floor, -1, lateralFriction=FLOOR_FRICTION * self._situation.friction, physicsClientId=self._world
         )
 
-    def _actuate(self, action: Array) -> None:
+    def actuate(self, action: Array) -> None:
+        """Sets the motors for one control step."""
         pybullet.setJointMotorControlArray(
-            self._robot,
+            self.robot,
             self.joints,
             pybullet.TORQUE_CONTROL,
             forces=(self._torque * action).tolist(),
             physicsClientId=self._world,
         )
 
-    def _observe(self) -> Array:
-        robot, world = self._robot, self._world
+    def observe(self) -> Array:
+        """Returns the observation as the sensors give it."""
+        robot, world = self.robot, self._world
         position, quaternion = pybullet.getBasePositionAndOrientation(robot, physicsClientId=world)
         velocity, angular_velocity = pybullet.getBaseVelocity(robot, physicsClientId=world)
         angles, speeds, _, _ = zip(*pybullet.getJointStates(robot, self.joints, physicsClientId=world), strict=True)
@@ -224,5 +226,5 @@ class AntEnv(BulletEnv):
         return self.terminate_when_fallen and bool(obs[0] < FALLEN_HEIGHT)
 
     def _camera(self) -> dict[str, Any]:
-        position, _ = pybullet.getBasePositionAndOrientation(self._robot, physicsClientId=self._world)
+        position, _ = pybullet.getBasePositionAndOrientation(self.robot, physicsClientId=self._world)
         return {"cameraTargetPosition": position, "distance": 3.0, "yaw": 15, "pitch": -25, "roll": 0}

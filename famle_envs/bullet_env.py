@@ -91,7 +91,8 @@ class BulletEnv(gym.Env[Array, Array]):
             )
         self.render_mode = render_mode
         self._situation = self._resolve(situation)
-        self._client: int | None = None
+        self.client: int | None = None
+        """Of the physics server; None once closed."""
         self._locked_at: dict[int, float] = {}
         self._obs: Array | None = None
         self._low, self._high = (end.astype(np.float64) for end in (self.action_space.low, self.action_space.high))
@@ -119,18 +120,18 @@ class BulletEnv(gym.Env[Array, Array]):
 
     def _simulate(self, action: Array) -> None:
         """One control step with an action that lies in the action space."""
-        self._actuate(action)
+        self.actuate(action)
         self._hold_locked_joints()
         for _ in range(self.physics_steps):
-            pybullet.stepSimulation(physicsClientId=self._client)
+            pybullet.stepSimulation(physicsClientId=self.client)
 
     @abstractmethod
-    def _actuate(self, action: Array) -> None:
+    def actuate(self, action: Array) -> None:
         """Sets the motors for one control step."""
 
     @abstractmethod
-    def _observe(self) -> Array:
-        """The observation as the sensors give it, faults included, as float32."""
+    def observe(self) -> Array:
+        """Returns the observation as the sensors give it, faults included, as float32."""
 
     @abstractmethod
     def _camera(self) -> dict[str, Any]:
@@ -168,7 +169,7 @@ class BulletEnv(gym.Env[Array, Array]):
         pybullet.restoreState(self._start, physicsClientId=self._world)
         self._perturb_start()
         self._apply_situation()
-        self._obs = self._observe()
+        self._obs = self.observe()
         return self._obs.copy(), self._info()
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -184,7 +185,7 @@ class BulletEnv(gym.Env[Array, Array]):
         if action.shape != self._low.shape or not math.isfinite(np.abs(action).max()):
             raise ValueError(f"The action must be {self.action_space.shape} finite numbers, got {action}.")
         self._simulate(np.minimum(np.maximum(action, self._low), self._high))
-        previous, self._obs = self._obs, self._observe()
+        previous, self._obs = self._obs, self.observe()
         reward = float(self.reward_fn(previous, action, self._obs))
         return self._obs.copy(), reward, self._has_ended(self._obs), False, self._info()
 
@@ -207,23 +208,23 @@ class BulletEnv(gym.Env[Array, Array]):
 
     def close(self) -> None:
         """Ends the physics world; a second call does nothing."""
-        if self._client is not None:
+        if self.client is not None:
             with suppress(pybullet.error):  # at the interpreter's end the world may be gone already
-                pybullet.disconnect(physicsClientId=self._client)
-            self._client = None
+                pybullet.disconnect(physicsClientId=self.client)
+            self.client = None
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self) | {"_obs": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         # A copy has a world of its own, in which it has not been reset: the number of this one may be anybody's there.
-        vars(self).update(state | {"_client": None})
-        if state["_client"] is not None:
+        vars(self).update(state | {"client": None})
+        if state["client"] is not None:
             self._load()
 
     def __del__(self) -> None:
         # A world that nobody closes would keep its memory until the process ends.
-        if getattr(self, "_client", None) is not None:
+        if getattr(self, "client", None) is not None:
             self.close()
 
     @property
@@ -233,15 +234,15 @@ class BulletEnv(gym.Env[Array, Array]):
 
     @property
     def _world(self) -> int:
-        if self._client is None:
+        if self.client is None:
             raise RuntimeError("The environment is closed; make a new one.")
-        return self._client
+        return self.client
 
     def _load(self) -> None:
         client = pybullet.connect(pybullet.DIRECT)
         if client < 0:
             raise RuntimeError("PyBullet gives no more physics worlds; close() environments that are not needed.")
-        self._client = client
+        self.client = client
         # Sleeping and unordered contact pairs would make a run depend on the runs before it.
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=self.time_step,
@@ -252,9 +253,9 @@ class BulletEnv(gym.Env[Array, Array]):
         )
         pybullet.setGravity(0.0, 0.0, -9.81, physicsClientId=client)
         with as_file(self.asset_folder / self.asset) as path:
-            self._robot = self._load_robot(str(path), client)
+            self.robot = self._load_robot(str(path), client)
         self.joint_limits = self._read_joint_limits()
-        shapes = pybullet.getVisualShapeData(self._robot, physicsClientId=client)
+        shapes = pybullet.getVisualShapeData(self.robot, physicsClientId=client)
         links = [shape[1] for shape in shapes]
         # (link, index among the link's shapes): colour
         self._colours = {(link, links[:i].count(link)): shapes[i][7] for i, link in enumerate(links)}
@@ -266,13 +267,13 @@ class BulletEnv(gym.Env[Array, Array]):
 
     def _read_joint_limits(self) -> Array:
         """Lower and upper end of each joint in rad, (2, n_joints); infinite for a joint that turns without end."""
-        info = [pybullet.getJointInfo(self._robot, joint, physicsClientId=self._world) for joint in self.joints]
+        info = [pybullet.getJointInfo(self.robot, joint, physicsClientId=self._world) for joint in self.joints]
         # PyBullet says "no limit" by a lower end above the upper one.
         ends = [(lower, upper) if lower <= upper else (-np.inf, np.inf) for lower, upper in (row[8:10] for row in info)]
         return np.array(ends).T
 
     def _apply_situation(self) -> None:
-        states = pybullet.getJointStates(self._robot, self.joints, physicsClientId=self._world)
+        states = pybullet.getJointStates(self.robot, self.joints, physicsClientId=self._world)
         self._locked_at = {self.joints[joint]: states[joint][0] for joint in self._situation.locked_joints}
         self._label = self._situation.label
         if self.render_mode is not None:
@@ -281,7 +282,7 @@ class BulletEnv(gym.Env[Array, Array]):
     def _hold_locked_joints(self) -> None:
         if self._locked_at:
             pybullet.setJointMotorControlArray(
-                self._robot,
+                self.robot,
                 list(self._locked_at),
                 pybullet.POSITION_CONTROL,
                 targetPositions=list(self._locked_at.values()),
@@ -294,7 +295,7 @@ class BulletEnv(gym.Env[Array, Array]):
         faulty |= set(self._locked_at)
         for (link, shape), colour in self._colours.items():
             rgba = _FAULTY_COLOUR if link in faulty else colour
-            pybullet.changeVisualShape(self._robot, link, shape, rgbaColor=rgba, physicsClientId=self._world)
+            pybullet.changeVisualShape(self.robot, link, shape, rgbaColor=rgba, physicsClientId=self._world)
 
     def _info(self) -> dict[str, Any]:
         # A string: Gymnasium wants nothing in `info` to be shared between two steps.

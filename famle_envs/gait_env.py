@@ -79,7 +79,7 @@ class GaitEnv(BulletEnv):
     @property
     def position(self) -> tuple[float, float, float]:
         """Where the body is, in m, whatever the sensors say."""
-        x, y, z = pybullet.getBasePositionAndOrientation(self._robot, physicsClientId=self._world)[0]
+        x, y, z = pybullet.getBasePositionAndOrientation(self.robot, physicsClientId=self._world)[0]
         return x, y, z
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
@@ -94,16 +94,16 @@ class GaitEnv(BulletEnv):
         targets += self._zero_errors
         targets[:, self._blocked] = self.rest_angles[self._blocked]
         for row in targets:
-            self._actuate(row)
+            self.actuate(row)
             pybullet.stepSimulation(physicsClientId=self._world)
 
-    def _actuate(self, action: Array) -> None:
+    def actuate(self, action: Array) -> None:
         """Sends the servos to joint angles, (n_joints,); no servo sees an error beyond its speed."""
-        states = pybullet.getJointStates(self._robot, self.joints, physicsClientId=self._world)
+        states = pybullet.getJointStates(self.robot, self.joints, physicsClientId=self._world)
         angles = np.array([state[0] for state in states])
         targets = angles + np.minimum(np.maximum(action - angles, -self._reach), self._reach)
         pybullet.setJointMotorControlArray(
-            self._robot,
+            self.robot,
             self.joints,
             pybullet.POSITION_CONTROL,
             targetPositions=targets.tolist(),
@@ -129,7 +129,7 @@ class GaitEnv(BulletEnv):
 
     def _measured_pose(self) -> tuple[list[float], list[float]]:
         """Position in m and roll, pitch and yaw in rad as the sensors give them; angles are not wrapped."""
-        position, quaternion = pybullet.getBasePositionAndOrientation(self._robot, physicsClientId=self._world)
+        position, quaternion = pybullet.getBasePositionAndOrientation(self.robot, physicsClientId=self._world)
         roll, pitch, yaw = pybullet.getEulerFromQuaternion(quaternion)
         angles = [roll, pitch, yaw + self._situation.orientation_error]
         profile = self.profile
@@ -172,10 +172,10 @@ class GaitEnv(BulletEnv):
             self._forces[joint] = HOLDING_FORCE
         for link, built in self._as_built.items():
             factor = profile.base_mass * situation.base_mass if link == -1 else profile.leg_mass
-            self._change(self._robot, link, mass=factor * built[0])
-            self._change(self._robot, link, localInertiaDiagonal=[factor * value for value in built[2]])
+            self._change(self.robot, link, mass=factor * built[0])
+            self._change(self.robot, link, localInertiaDiagonal=[factor * value for value in built[2]])
         for joint, built in zip(self.joints, self._damping_as_built, strict=True):
-            self._change(self._robot, joint, jointDamping=built + profile.joint_damping)
+            self._change(self.robot, joint, jointDamping=built + profile.joint_damping)
         friction = self.floor_friction * profile.floor_friction * situation.friction
         self._change(self._floor, -1, lateralFriction=friction)
         if profile.contact_stiffness:

@@ -149,12 +149,13 @@ class MinitaurEnv(GaitEnv):
         forwards = -_FULL_SWING * swing
         return np.stack([length + forwards, length - forwards], axis=2).reshape(len(swing), len(_MOTORS))
 
-    def _observe(self) -> Array:
+    def observe(self) -> Array:
+        """Returns the observation as the sensors give it."""
         position, angles = self._measured_pose()
         return np.array((*position, *(wrapped(angle) for angle in angles)), dtype=np.float32)
 
     def _has_ended(self, obs: Array) -> bool:
-        _, quaternion = pybullet.getBasePositionAndOrientation(self._robot, physicsClientId=self._world)
+        _, quaternion = pybullet.getBasePositionAndOrientation(self.robot, physicsClientId=self._world)
         return bool(pybullet.getMatrixFromQuaternion(quaternion)[8] < _FALLEN_TILT)
 
     def _place_robot(self, path: str, client: int) -> int:

@@ -166,7 +166,8 @@ class QuadrupedEnv(GaitEnv):
         legs = np.stack([_BACKWARDS * swing, lift, lift], axis=2)
         return _FULL_SWING * legs.reshape(len(swing), _N_JOINTS)
 
-    def _observe(self) -> Array:
+    def observe(self) -> Array:
+        """Returns the observation as the sensors give it."""
         (x, y, _), (_, _, yaw) = self._measured_pose()
         return np.array((x, y, math.sin(yaw), math.cos(yaw)), dtype=np.float32)
 

@@ -158,13 +158,14 @@ class ReacherEnv(BulletEnv):
             )
         return int(robot)
 
-    def _actuate(self, action: Array) -> None:
+    def actuate(self, action: Array) -> None:
+        """Sets the motors for one control step."""
         speed = MAX_SPEED * np.clip(np.multiply(self._situation.motor_gain, action), -1.0, 1.0)
         # A servo stops at its joint's end. One that pushed on against it would turn the whole arm in this simulator.
-        states = pybullet.getJointStates(self._robot, self.joints, physicsClientId=self._world)
+        states = pybullet.getJointStates(self.robot, self.joints, physicsClientId=self._world)
         lower, upper = (self.joint_limits - np.array([state[0] for state in states])) / self.control_period
         pybullet.setJointMotorControlArray(
-            self._robot,
+            self.robot,
             self.joints,
             pybullet.VELOCITY_CONTROL,
             targetVelocities=np.clip(speed, lower, upper).tolist(),
@@ -172,11 +173,12 @@ class ReacherEnv(BulletEnv):
             physicsClientId=self._world,
         )
 
-    def _observe(self) -> Array:
-        states = pybullet.getJointStates(self._robot, self.joints, physicsClientId=self._world)
+    def observe(self) -> Array:
+        """Returns the observation as the sensors give it."""
+        states = pybullet.getJointStates(self.robot, self.joints, physicsClientId=self._world)
         angles = np.array([state[0] for state in states]) + self._situation.joint_offset
         velocities = np.clip([state[1] for state in states], -SENSED_SPEED, SENSED_SPEED)
-        tip = pybullet.getLinkState(self._robot, _TIP_LINK, computeForwardKinematics=True, physicsClientId=self._world)[
+        tip = pybullet.getLinkState(self.robot, _TIP_LINK, computeForwardKinematics=True, physicsClientId=self._world)[
             4
         ]
         wrapped = (angles + math.pi) % (2 * math.pi) - math.pi

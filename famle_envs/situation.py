@@ -101,10 +101,10 @@ class Situation:
     @property
     def faults(self) -> frozenset[str]:
         """The names of the fields that differ from an intact robot."""
-        return frozenset(name for name, value in self._canonical().items() if value != _INTACT[name])
+        return frozenset(name for name, value in self.canonical().items() if value != _INTACT[name])
 
-    def _canonical(self) -> dict[str, Any]:
-        """All fields but the name, without the joints at the end of a tuple that are as built."""
+    def canonical(self) -> dict[str, Any]:
+        """Returns all fields but the name, without the joints at the end of a tuple that are as built."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "name"}
         return values | {
             "motor_gain": _strip(self.motor_gain, 1.0),
@@ -114,10 +114,10 @@ class Situation:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Situation):
             return NotImplemented
-        return self._canonical() == other._canonical()
+        return self.canonical() == other.canonical()
 
     def __hash__(self) -> int:
-        return hash(tuple(self._canonical().values()))
+        return hash(tuple(self.canonical().values()))
 
     def __str__(self) -> str:
         clauses = [_describe_gain(joint, gain) for joint, gain in enumerate(self.motor_gain) if gain != 1.0]
@@ -346,4 +346,4 @@ def _suggest(word: str, known: Sequence[str]) -> str:
     return f"; did you mean {close[0]!r}?" if close else "."
 
 
-_INTACT = Situation()._canonical()
+_INTACT = Situation().canonical()

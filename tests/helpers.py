@@ -92,11 +92,11 @@ def watch(env: GaitEnv, action: Any, read: Callable[[GaitEnv], Any]) -> Array:
 
 
 def joint_angles(env: GaitEnv) -> list[float]:
-    return [state[0] for state in pybullet.getJointStates(env._robot, env.joints, physicsClientId=env._client)]
+    return [state[0] for state in pybullet.getJointStates(env.robot, env.joints, physicsClientId=env.client)]
 
 
 def joint_speeds(env: GaitEnv) -> list[float]:
-    return [state[1] for state in pybullet.getJointStates(env._robot, env.joints, physicsClientId=env._client)]
+    return [state[1] for state in pybullet.getJointStates(env.robot, env.joints, physicsClientId=env.client)]
 
 
 def masses(env: GaitEnv) -> Array:
@@ -110,13 +110,13 @@ def inertias(env: GaitEnv) -> Array:
 
 
 def _dynamics(env: GaitEnv) -> list[tuple[Any, ...]]:
-    links = range(-1, pybullet.getNumJoints(env._robot, physicsClientId=env._client))
-    return [pybullet.getDynamicsInfo(env._robot, link, physicsClientId=env._client) for link in links]
+    links = range(-1, pybullet.getNumJoints(env.robot, physicsClientId=env.client))
+    return [pybullet.getDynamicsInfo(env.robot, link, physicsClientId=env.client) for link in links]
 
 
 def put(env: GaitEnv, place: tuple[float, float, float], quaternion: Any = (0.0, 0.0, 0.0, 1.0)) -> None:
     """Moves the robot as a whole; x, y, z, w of the quaternion."""
-    pybullet.resetBasePositionAndOrientation(env._robot, place, quaternion, physicsClientId=env._client)
+    pybullet.resetBasePositionAndOrientation(env.robot, place, quaternion, physicsClientId=env.client)
 
 
 # --- models -------------------------------------------------------------------------------------------------

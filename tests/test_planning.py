@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from famle_agent.planning import ICEM, MPPI, Planner, RandomShooting, _coloured_noise, imagine, shift
+from famle_agent.planning import ICEM, MPPI, Planner, RandomShooting, coloured_noise, imagine, shift
 
 PLANNERS = {
     "random shooting": lambda H: RandomShooting(H, candidates=3000),
@@ -165,7 +165,7 @@ def test_candidates_and_plans_stay_in_range(make: Make) -> None:
 @given(st.integers(1, 40), st.floats(0.0, 4.0), st.integers(1, 3))
 def test_noise_has_unit_variance_and_no_mean(horizon: int, beta: float, action_dim: int) -> None:
     n = 4000
-    noise = _coloured_noise(torch.zeros(2, horizon, action_dim), n, beta, generator())
+    noise = coloured_noise(torch.zeros(2, horizon, action_dim), n, beta, generator())
     assert noise.shape == (2, n, horizon, action_dim)
     flat = noise.transpose(0, 2).reshape(horizon, -1)
     assert (flat.std(dim=1) - 1.0).abs().max() < 0.06
@@ -175,7 +175,7 @@ def test_noise_has_unit_variance_and_no_mean(horizon: int, beta: float, action_d
 def test_noise_is_smoother_for_a_steeper_spectrum() -> None:
     like, roughness = torch.zeros(1, 20, 1), []
     for beta in (0.0, 1.0, 2.0, 4.0):
-        noise = _coloured_noise(like, 500, beta, generator())
+        noise = coloured_noise(like, 500, beta, generator())
         roughness.append(noise.diff(dim=2).square().mean().item())
     assert roughness == sorted(roughness, reverse=True)
     assert roughness[0] == pytest.approx(2.0, rel=0.1)  # independent steps

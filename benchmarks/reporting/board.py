@@ -80,7 +80,7 @@ def _write_replicate(study: Study, method: str, run: Result, known: dict[str, li
     scores = _scores(study, run)
     with SummaryWriter(str(folder / experiment.folder / method / f"seed-{run['seed']}")) as writer:
         for summary in hparams(parameters, dict.fromkeys(METRICS), known):  # type: ignore[no-untyped-call]
-            writer._get_file_writer().add_summary(summary)
+            writer._get_file_writer().add_summary(summary)  # noqa: SLF001 - no public way to add one
         for tag, value in scores.items():
             writer.add_scalar(tag, value)
         for step, value in zip(*study.trace(run), strict=True):

@@ -71,7 +71,8 @@ class ModelBasedAgent(SimulationLearner):
         """
         model = self.model
         # A tensor counts how often it was written to: learning, loading and set_parameters change a model in place.
-        known = model, model.embeddings._version, self.hyperparameters, self.seed
+        version = model.embeddings._version  # noqa: SLF001 - the tensor's own count has no public name
+        known = model, version, self.hyperparameters, self.seed
         if self._known_adapter is None or self._known_adapter[0] != known:
             self._known_adapter = known, self._new_adapter(model)
         return self._known_adapter[1]
@@ -86,7 +87,7 @@ class ModelBasedAgent(SimulationLearner):
         """
         settings = self.hyperparameters
         how = settings.adapt_every, settings.adapt_at_reset, settings.forget_at_reset
-        return Controller(self.adapter, self.planner, self._unit_reward_fn(), *how)
+        return Controller(self.adapter, self.planner, self.unit_reward_fn(), *how)
 
     def learn(
         self,
@@ -118,12 +119,12 @@ class ModelBasedAgent(SimulationLearner):
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         hooks.on_training_start(locals(), globals())
-        controller, state = self.controller, self._state_of(env.num_envs)
+        controller, state = self.controller, self.state_of(env.num_envs)
         starts = torch.as_tensor(self._last_episode_starts, dtype=torch.bool, device=self.device)
         nobody = torch.zeros_like(starts)
         while self.num_timesteps < total_timesteps:
             hooks.on_rollout_start()
-            action, state = controller.act(state, self._tensor(self._last_obs), starts, self._generator)
+            action, state = controller.act(state, self._tensor(self._last_obs), starts, self.generator)
             new_obs, rewards, dones, infos = env.step(self._to_env(action))
             self.num_timesteps += env.num_envs
             reached = self._tensor(_before_reset(new_obs, dones, infos))
@@ -195,11 +196,11 @@ class ModelBasedAgent(SimulationLearner):
                 f"Got {len(obs)} observations, but {len(starts)} values of episode_start and a state of "
                 f"{len(obs) if state is None else state.robots} robots; they must be of the same robots."
             )
-        generator = self._generator
+        generator = self.generator
         if deterministic:
             generator = torch.Generator(self.device).manual_seed(self.seed or 0)
         if state is None:
-            action, state = controller.act(self._state_of(len(obs)), obs, starts, generator)
+            action, state = controller.act(self.state_of(len(obs)), obs, starts, generator)
             if self._live is not None and self._live.robots == len(obs):
                 self._live = replace(self._live, plan=state.plan)  # a loop that drops the state keeps its plan
         else:
@@ -225,7 +226,7 @@ class ModelBasedAgent(SimulationLearner):
         a = self._tensor(np.atleast_2d(check_action(action, self.action_space)))
         if not len(s) == len(a) == len(s_next):
             raise ValueError(f"Got {len(s)} observations, {len(a)} actions and {len(s_next)} next observations.")
-        state = replace(self._state_of(len(s)), last=(s, self._action_scale().to_unit(a).clamp(-1.0, 1.0)))
+        state = replace(self.state_of(len(s)), last=(s, self._action_scale().to_unit(a).clamp(-1.0, 1.0)))
         moved = torch.zeros(len(s), dtype=torch.bool, device=self.device)
         self._live = self._observed(controller.observe(state, s_next, moved))
 
@@ -256,7 +257,7 @@ class ModelBasedAgent(SimulationLearner):
     @property
     def belief(self) -> Belief:
         """What the agent believes of its robots now; of one robot where it has seen none."""
-        return (self._live or self._state_of(self.model.robots)).belief
+        return (self._live or self.state_of(self.model.robots)).belief
 
     @abstractmethod
     def posterior(self, state: OnlineState | None = None) -> dict[str, float]:
@@ -279,8 +280,15 @@ class ModelBasedAgent(SimulationLearner):
             )
         return state
 
-    def _state_of(self, robots: int) -> OnlineState:
-        """What the agent believes now where that fits the number of robots, else what it meta-learned."""
+    def state_of(self, robots: int) -> OnlineState:
+        """Returns what the agent believes now where that fits the number of robots, else what it meta-learned.
+
+        Args:
+            robots: B.
+
+        Raises:
+            NotLearnedError: The agent has no model yet.
+        """
         if self._live is not None and self._live.robots == robots:
             return replace(self._live, last=None)
         model = self.model
@@ -304,10 +312,10 @@ class ModelBasedAgent(SimulationLearner):
         live = self._live
         parts: dict[str, dict[str, Tensor]] = {
             "dynamics": {} if self.dynamics is None else self.dynamics.state_dict(),
-            "reward": {} if self._learned_reward is None else self._learned_reward.state_dict(),
+            "reward": {} if self.learned_reward is None else self.learned_reward.state_dict(),
             "live": {} if live is None else live.to_tensors(),
             # The state of another device's generator means nothing elsewhere.
-            "generator": {"state": self._generator.get_state()} if self.device.type == "cpu" else {},
+            "generator": {"state": self.generator.get_state()} if self.device.type == "cpu" else {},
         }
         Checkpoint(
             kind=type(self).__name__,
@@ -416,21 +424,21 @@ class ModelBasedAgent(SimulationLearner):
             if stored.live is not None:
                 self._live = self._online_state(stored, stored.live)
             if self.device.type == "cpu" and (generator := stored.part("generator")):
-                self._generator.set_state(generator["state"])
+                self.generator.set_state(generator["state"])
         except (KeyError, RuntimeError, TypeError) as error:
             raise ValueError(
-                "The file's weights do not fit the agent's settings; it is damaged, or an override changed the network: "
+                "The file's weights do not fit its settings; it is damaged, or an override changed the network: "
                 f"{error}"
             ) from error
 
     def _take_weights(self, stored: Checkpoint) -> None:
         if weights := stored.part("dynamics"):
             robots = max(1, len(weights["embeddings"]) // self.hyperparameters.members)
-            self.dynamics = self._new_dynamics(robots)
+            self.dynamics = self.new_dynamics(robots)
             self.dynamics.load_state_dict(weights)
         if weights := stored.part("reward"):
-            self._learned_reward = self._new_reward()
-            self._learned_reward.load_state_dict(weights)
+            self.learned_reward = self._new_reward()
+            self.learned_reward.load_state_dict(weights)
 
     def _online_state(self, stored: Checkpoint, counts: dict[str, int]) -> OnlineState | None:
         settings = self.hyperparameters
@@ -455,14 +463,18 @@ class ModelBasedAgent(SimulationLearner):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ([] if self.dynamics is None else ["dynamics"]), []
 
-    def _unit_reward_fn(self) -> RewardFn:
-        """The reward of actions in [-1, 1]."""
+    def unit_reward_fn(self) -> RewardFn:
+        """Returns the reward r(s, a, s') of actions in [-1, 1], the user's, the environment's or the learnt one.
+
+        Raises:
+            ValueError: The agent has no reward.
+        """
         known, scale = self._known_reward_fn(), self._action_scale()
         if known is not None:
             return lambda obs, action, next_obs: known(obs, scale.from_unit(action), next_obs)
-        if self._learned_reward is None:
+        if self.learned_reward is None:
             raise ValueError("The agent has no reward; give load() the environment (env=...) or a reward_fn.")
-        return self._learned_reward
+        return self.learned_reward
 
     def _to_env(self, action: Tensor) -> Array:
         """From [-1, 1] to the action space."""

@@ -78,7 +78,7 @@ class ModelBasedAlgorithm(BaseAlgorithm):
         ValueError: The environment is unknown or its spaces are not supported, or a setting is out of range.
     """
 
-    _implied: ClassVar[Mapping[str, Any]] = {}
+    implied: ClassVar[Mapping[str, Any]] = {}
     """Settings that the kind of agent implies, in every mode."""
 
     dynamics: Dynamics | None
@@ -122,13 +122,13 @@ class ModelBasedAlgorithm(BaseAlgorithm):
         if self.env is not None:
             self._describe_env(self.env)
         robot = robot_of(None if self.env is None else env_id(self.env))
-        self.hyperparameters = robot.hyperparameters(mode, self._method(overrides), **{**self._implied, **overrides})
+        self.hyperparameters = robot.hyperparameters(mode, self._method(overrides), **{**self.implied, **overrides})
         self._reward_fn = reward_fn
         if self.env is not None:
             self._take_reward(self.env)
-        self._learned_reward: LearnedReward | None = None
+        self.learned_reward: LearnedReward | None = None
         self.dims = self._dims_of(angle_dims, quaternion_dims, pose_dims)
-        self._generator = torch.Generator(self.device)
+        self.generator = torch.Generator(self.device)
         self._not_taken: list[str] = []
         self._setup_model()
         if pretrained and robot.pretrained is not None:
@@ -140,7 +140,7 @@ class ModelBasedAlgorithm(BaseAlgorithm):
 
     def _setup_model(self) -> None:
         self.dynamics = None
-        self._generator.seed()
+        self.generator.seed()
         self.set_random_seed(self.seed)
 
     def set_random_seed(self, seed: int | None = None) -> None:
@@ -149,7 +149,7 @@ class ModelBasedAlgorithm(BaseAlgorithm):
             return
         super().set_random_seed(seed)
         self.seed = seed
-        self._generator.manual_seed(seed)
+        self.generator.manual_seed(seed)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Gives the agent another environment with the same spaces and any number of robots.
@@ -203,7 +203,8 @@ class ModelBasedAlgorithm(BaseAlgorithm):
     def _n_embeddings(self) -> int:
         """How many situations the model tells apart."""
 
-    def _new_dynamics(self, robots: int = 1) -> Dynamics:
+    def new_dynamics(self, robots: int = 1) -> Dynamics:
+        """Makes an untrained model of the agent's settings, for one robot or for several with a network each."""
         settings = self.hyperparameters
         return Dynamics(
             self.observation_space.shape[0],
@@ -258,7 +259,7 @@ class ModelBasedAlgorithm(BaseAlgorithm):
         return self.dynamics
 
     def _draw_seed(self) -> int:
-        return int(torch.randint(2**31, (), generator=self._generator, device=self.device))
+        return int(torch.randint(2**31, (), generator=self.generator, device=self.device))
 
     def _tensor(self, values: Any) -> Tensor:
         return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=self.device)

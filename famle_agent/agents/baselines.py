@@ -20,7 +20,7 @@ _EVERY_SITUATION = "every situation"
 class _OneModelAgent(ModelBasedAgent):
     """An agent that does not tell situations apart: its model has one embedding, which never changes."""
 
-    _implied: ClassVar[Mapping[str, Any]] = {
+    implied: ClassVar[Mapping[str, Any]] = {
         "embedding_dim": 1,
         "embedding_lr": 0.0,
         "adapt_embedding_lr": 0.0,
@@ -63,8 +63,8 @@ class AMPC(_OneModelAgent):
         {'every situation': 1.0}
     """
 
-    _implied: ClassVar[Mapping[str, Any]] = {
-        **_OneModelAgent._implied,
+    implied: ClassVar[Mapping[str, Any]] = {
+        **_OneModelAgent.implied,
         "rounds": 0,
         "joint_iterations": 0,
         "meta_iterations": 0,

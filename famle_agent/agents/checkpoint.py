@@ -127,8 +127,8 @@ class Checkpoint:
             "class": self.kind,
             "mode": self.mode,
             "hyperparameters": self.hyperparameters.to_dict(),
-            "observation_space": _box_to_json(self.observation_space),
-            "action_space": _box_to_json(self.action_space),
+            "observation_space": box_to_json(self.observation_space),
+            "action_space": box_to_json(self.action_space),
             **{name: list(dims) for name, dims in self.dims.items()},
             "situations": list(self.situations),
             "env": self.env,
@@ -156,8 +156,8 @@ class Checkpoint:
                 kind=str(meta["class"]),
                 mode=meta["mode"],
                 hyperparameters=Hyperparameters.from_dict(meta["hyperparameters"]),
-                observation_space=_box_from_json(meta["observation_space"]),
-                action_space=_box_from_json(meta["action_space"]),
+                observation_space=box_from_json(meta["observation_space"]),
+                action_space=box_from_json(meta["action_space"]),
                 dims={name: tuple(meta.get(name, ())) for name in DIMS},
                 situations=tuple(str(name) for name in list(meta["situations"])),
                 env=meta["env"],
@@ -197,7 +197,7 @@ class Checkpoint:
             raise ValueError(f"The file's environment cannot be made ({error!r}); give load(..., env=...).") from error
 
 
-def _box_to_json(space: spaces.Box) -> dict[str, Any]:
+def box_to_json(space: spaces.Box) -> dict[str, Any]:
     """A Box space as JSON; infinite bounds are written as null."""
 
     def bound(values: Any) -> list[float | None]:
@@ -206,8 +206,8 @@ def _box_to_json(space: spaces.Box) -> dict[str, Any]:
     return {"low": bound(space.low), "high": bound(space.high), "shape": list(space.shape), "dtype": str(space.dtype)}
 
 
-def _box_from_json(values: dict[str, Any]) -> spaces.Box:
-    """The inverse of :func:`_box_to_json`."""
+def box_from_json(values: dict[str, Any]) -> spaces.Box:
+    """The inverse of :func:`box_to_json`."""
     dtype, shape = np.dtype(values["dtype"]), tuple(values["shape"])
     low = np.array([-np.inf if value is None else value for value in values["low"]], dtype=dtype).reshape(shape)
     high = np.array([np.inf if value is None else value for value in values["high"]], dtype=dtype).reshape(shape)

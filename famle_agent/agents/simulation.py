@@ -103,17 +103,17 @@ class SimulationLearner(ModelBasedAlgorithm):
         self.num_timesteps = 0
         self.forget()
         if folder is not None and self.seed is not None:
-            self._generator.manual_seed(self.seed)  # the same call draws the same numbers, be it the first or not
+            self.generator.manual_seed(self.seed)  # the same call draws the same numbers, be it the first or not
         hooks.on_training_start(locals(), globals())
-        known = self.situations, self.dynamics, self._learned_reward
+        known = self.situations, self.dynamics, self.learned_reward
         try:
             with closing(self._train(source, rounds, run, n_jobs, progress_bar)) as training:
                 for metrics in training:
-                    if not self._log_iteration(metrics, max(1, total_timesteps // 200), hooks):
+                    if not self.log_iteration(metrics, max(1, total_timesteps // 200), hooks):
                         break
             self._log_model()
         except BaseException:
-            self.situations, self.dynamics, self._learned_reward = known  # half-learnt models are none
+            self.situations, self.dynamics, self.learned_reward = known  # half-learnt models are none
             self.num_timesteps = 0
             raise
         hooks.on_training_end()
@@ -139,7 +139,7 @@ class SimulationLearner(ModelBasedAlgorithm):
                 n = (settings.round_transitions if number else settings.transitions_per_situation) * len(source.sources)
                 with bar("Simulating", number, n, "step") as simulating:
                     new = self._simulate(source, number, n_jobs, folder.transitions(number), simulating.update)
-            new = self._in_model_units(new)
+            new = self.in_model_units(new)
             transitions = new if transitions is None else transitions.followed_by(new)
             if (agent := folder.finished(number)) is not None:
                 self.restore(agent)
@@ -152,10 +152,10 @@ class SimulationLearner(ModelBasedAlgorithm):
                 torch.manual_seed(self._draw_seed())  # initial weights come from torch's global generator
                 self.situations = transitions.situations
                 self._learn_reward(transitions)  # first, so that callbacks can let the agent act
-                model, data = self._begin_model(transitions, number == 0 or (last and settings.restart_last_round))
+                model, data = self.begin_model(transitions, number == 0 or (last and settings.restart_last_round))
                 progress = partial(self._progress, folder, number, learning)
                 trainer = settings.trainer(number, self._meta_learner() if last else None)
-                for metrics in trainer.fit(model, data, self._generator, progress):
+                for metrics in trainer.fit(model, data, self.generator, progress):
                     shown = {key.split("/")[-1]: f"{value:.3g}" for key, value in metrics.items()}
                     learning.set_postfix(shown, refresh=False)
                     learning.update()
@@ -200,9 +200,9 @@ class SimulationLearner(ModelBasedAlgorithm):
     def planning_policy(self) -> MakePolicy:
         """Makes a policy that plans with what the agent has learnt so far, and knows which situation it is in."""
         model, reward_fn = deepcopy(self.model).cpu(), self._reward_fn
-        if reward_fn is None and self._learned_reward is not None:
+        if reward_fn is None and self.learned_reward is not None:
             learned, scale = (
-                deepcopy(self._learned_reward).cpu(),
+                deepcopy(self.learned_reward).cpu(),
                 ActionScale.of(self.action_space, torch.device("cpu")),
             )
 
@@ -225,8 +225,12 @@ class SimulationLearner(ModelBasedAlgorithm):
             "hyperparameters": self.hyperparameters.to_dict(),
         }
 
-    def _in_model_units(self, transitions: Transitions) -> Transitions:
-        """The same with actions in [-1, 1]."""
+    def in_model_units(self, transitions: Transitions) -> Transitions:
+        """Returns the same with actions in [-1, 1].
+
+        Raises:
+            ValueError: The observations or the actions are not of the agent's spaces.
+        """
         if (
             transitions.obs.shape[-1:] != self.observation_space.shape
             or transitions.action.shape[-1:] != self.action_space.shape
@@ -240,11 +244,12 @@ class SimulationLearner(ModelBasedAlgorithm):
 
     def _learn_reward(self, transitions: Transitions) -> None:
         if self._known_reward_fn() is None:
-            self._learned_reward = self._new_reward()
+            self.learned_reward = self._new_reward()
             obs, action, next_obs = self._tensors(transitions.obs, transitions.action, transitions.next_obs)
-            self._learned_reward.fit(obs, action, next_obs, self._tensor(transitions.reward), self._generator)
+            self.learned_reward.fit(obs, action, next_obs, self._tensor(transitions.reward), self.generator)
 
-    def _log_iteration(self, scalars: dict[str, float], interval: int, hooks: BaseCallback) -> bool:
+    def log_iteration(self, scalars: dict[str, float], interval: int, hooks: BaseCallback) -> bool:
+        """Logs an iteration of the meta-training and returns whether the callbacks want to go on."""
         self.num_timesteps += 1
         for key, value in scalars.items():
             self.logger.record(key, value)
@@ -253,11 +258,11 @@ class SimulationLearner(ModelBasedAlgorithm):
         hooks.update_locals(locals())
         return hooks.on_step()
 
-    def _begin_model(self, transitions: Transitions, new: bool) -> tuple[Dynamics, Batch]:
-        """The model, be it a new one or the one so far, and the transitions as it sees them."""
+    def begin_model(self, transitions: Transitions, new: bool) -> tuple[Dynamics, Batch]:
+        """Returns the model, be it a new one or the one so far, and the transitions as it sees them."""
         obs, action, next_obs = self._tensors(transitions.obs, transitions.action, transitions.next_obs)
         if new:
-            self.dynamics = self._new_dynamics()
+            self.dynamics = self.new_dynamics()
             self.dynamics.fit_normalisation(obs, action, next_obs)
         model = self.model
         return model, model.encode(obs, action, next_obs)

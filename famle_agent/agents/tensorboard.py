@@ -59,9 +59,8 @@ def log_gif(logger: Logger, tag: str, frames: Frames, fps: float, step: int) -> 
     height, width = frames[0].shape[:2]
     image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=encode_gif(frames, fps))
     for writer in _writers(logger):
-        writer._get_file_writer().add_summary(  # type: ignore[no-untyped-call]
-            Summary(value=[Summary.Value(tag=tag, image=image)]), step
-        )
+        file = writer._get_file_writer()  # type: ignore[no-untyped-call]  # noqa: SLF001 - the only way to a GIF
+        file.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
 
 
 def encode_gif(frames: Frames, fps: float) -> bytes:

@@ -79,16 +79,16 @@ class MAML:
         for iteration in left:
             drawn = torch.randperm(n_situations, generator=generator, device=generator.device)
             c = drawn[:meta_batch_size].to(data.x.device)
-            support, query = self._sample(data, c.repeat_interleave(model.members), generator)
+            support, query = self.sample(data, c.repeat_interleave(model.members), generator)
 
             theta, h = expand(dict(model.theta.items()), meta_batch_size), model.embeddings_of(c).detach()
-            theta_tilde, loss_before = self._adapt(model, theta, h, support, inner_loop)
+            theta_tilde, loss_before = self.adapt(model, theta, h, support, inner_loop)
             loss_after = model.loss(theta_tilde, h, query).mean()
 
             optimizer.zero_grad()
             # The members know nothing of each other: each descends its own mean over the situations.
             torch.autograd.backward(loss_after * model.members)
-            self._shorten_gradients(model)
+            self.shorten_gradients(model)
             optimizer.step()
             schedule.step()
 
@@ -97,10 +97,10 @@ class MAML:
                 raise ValueError(f"MAML diverged in iteration {step.iteration}; take a smaller inner_lr or meta_lr.")
             yield step
 
-    def _adapt(
+    def adapt(
         self, model: Dynamics, theta: Theta, h: Tensor, support: Batch, inner_loop: InnerLoop
     ) -> tuple[Theta, Tensor]:
-        """theta~ = U^k(theta) as a function of theta, to be differentiated, and the loss before it, (B,)."""
+        """Returns theta~ = U^k(theta) as a function of theta, to be differentiated, and the loss before it, (B,)."""
 
         def loss_of(theta: Theta) -> tuple[Tensor, Tensor]:
             loss = model.loss(theta, h, support)
@@ -115,16 +115,19 @@ class MAML:
             losses.append(loss)
         return theta, losses[0]
 
-    def _shorten_gradients(self, model: Dynamics) -> None:
-        """Where the inner steps nearly diverge, a few situations' gradients would drown all the others."""
+    def shorten_gradients(self, model: Dynamics) -> None:
+        """Limits the length of each member's gradient.
+
+        Where the inner steps nearly diverge, a few situations' gradients would drown all the others.
+        """
         gradients = [value.grad for value in model.theta.values() if value.grad is not None]
         squared = [gradient.flatten(1).square().sum(dim=1) for gradient in gradients]
         factor = (self.max_grad_norm / (torch.stack(squared).sum(dim=0).sqrt() + 1e-6)).clamp(max=1.0)
         for gradient in gradients:
             gradient.mul_(factor.view(-1, *[1] * (gradient.ndim - 1)))
 
-    def _sample(self, data: Batch, c: Tensor, generator: torch.Generator) -> tuple[Batch, Batch]:
-        """Transitions of the situations in ``c`` for the inner steps, and others to judge them by; own ones a row."""
+    def sample(self, data: Batch, c: Tensor, generator: torch.Generator) -> tuple[Batch, Batch]:
+        """Draws for each situation in ``c`` transitions for the inner steps, and others to judge them by."""
         chance = torch.rand(len(c), data.x.shape[1], generator=generator, device=generator.device)
         order = chance.argsort(dim=1).to(data.x.device)
         support, query, _ = order.tensor_split([self.batch_size, self.batch_size + self.query_size], dim=1)

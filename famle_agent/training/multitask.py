@@ -62,7 +62,7 @@ class JointTraining:
             self.iterations, generator, model=model, optimizer=optimizer, schedule=schedule
         )
         for _ in left:
-            c, batch = self._sample(data, model.members, generator)
+            c, batch = self.sample(data, model.members, generator)
             loss = model.loss(theta, model.embeddings[member, model.embedding_index(c)], batch)
             optimizer.zero_grad()
             loss.sum().backward()  # type: ignore[no-untyped-call]
@@ -70,8 +70,8 @@ class JointTraining:
             schedule.step()
             yield loss.detach().mean().item()
 
-    def _sample(self, data: Batch, members: int, generator: torch.Generator) -> tuple[torch.Tensor, Batch]:
-        """A minibatch for each member, and the situations c (P, batch_size) that its transitions are from."""
+    def sample(self, data: Batch, members: int, generator: torch.Generator) -> tuple[torch.Tensor, Batch]:
+        """Draws a minibatch for each member, and the situations c (P, batch_size) that its transitions are from."""
         n_situations, n = data.weight.shape
         shape, device = (members, self.batch_size), generator.device
         c = torch.randint(n_situations, shape, generator=generator, device=device).to(data.x.device)

@@ -90,7 +90,7 @@ class Reptile:
             theta, h = model.parameters_by_name(), model.embeddings_of(c)
 
             # theta~, h~ = U^k(theta, h_c) (line 11).
-            sample = partial(self._sample, data, c.repeat_interleave(model.members), generator)
+            sample = partial(self.sample, data, c.repeat_interleave(model.members), generator)
             theta_tilde, h_tilde, losses = inner_loop(model, expand(theta, meta_batch_size), h, sample)
 
             # Move theta towards the mean of theta~ and each h_c towards its h~ (lines 12 and 13).
@@ -103,8 +103,8 @@ class Reptile:
 
             yield MetaStep(iteration + 1, c, losses[0].mean().item(), losses[-1].mean().item())
 
-    def _sample(self, data: Batch, c: Tensor, generator: torch.Generator) -> Batch:
-        """A minibatch of each situation in ``c``, with repetitions."""
+    def sample(self, data: Batch, c: Tensor, generator: torch.Generator) -> Batch:
+        """Draws a minibatch of each situation in ``c``, with repetitions."""
         shape = (len(c), self.batch_size)
         i = torch.randint(data.x.shape[1], shape, generator=generator, device=generator.device).to(data.x.device)
         return Batch(data.x[c[:, None], i], data.y[c[:, None], i], data.weight[c[:, None], i])

@@ -72,7 +72,7 @@ def test_filtering_agent_names_the_situation_and_notices_the_break(load_agent: C
     assert max(posterior, key=lambda name: posterior[name]) == "intact"
 
     env.unwrapped.set_situation("joint 0 reversed")
-    obs = env.unwrapped._observe()
+    obs = env.unwrapped.observe()
     state = agent.predict(obs, None)[1] if state is None else state
     for _ in range(8):
         action, state = agent.predict(obs, state)

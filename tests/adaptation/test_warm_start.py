@@ -16,6 +16,7 @@ from famle_agent.adaptation.belief import Belief
 from famle_agent.adaptation.memory import Memory
 from famle_agent.adaptation.posterior import better_explained
 from famle_agent.adaptation.update import descend, select
+from famle_agent.data.action_scaling import to_action_space
 
 WINDOW = 6
 DEAD, REVERSED, STRANGE = 4, 6, 11  # joint 3 dead, joint 0 reversed, and what was not trained
@@ -59,12 +60,11 @@ def tell(agent: FAMLE, data: Transitions, situations: list[int], steps: range) -
 
 def agent_units(agent: FAMLE, action: object) -> object:
     """Actions of the model, in [-1, 1], as the environment's."""
-    return agent._to_env(torch.as_tensor(action))
+    return to_action_space(torch.as_tensor(action), agent.action_space)
 
 
 def memory(agent: FAMLE) -> Memory:
-    assert agent._live is not None
-    return agent._live.memory
+    return agent.state_of(len(agent.belief.candidate)).memory
 
 
 # --- life -------------------------------------------------------------------------------------------------
@@ -75,7 +75,7 @@ def test_belief_is_judged_by_what_it_has_not_seen(load: Load, data: Transitions,
     agent = load(keep_adapting=keep_adapting)
     model = agent.model
     for i in range(8):
-        before: Belief = agent._state_of(1).belief
+        before: Belief = agent.state_of(1).belief
         tell(agent, data, [DEAD], range(i, i + 1))
         seen = memory(agent)
         newest = model.encode(*(values[:, -1:] for values in (seen.obs, seen.action, seen.next_obs)))
@@ -95,7 +95,7 @@ def after_each_adaptation(
 ) -> Iterator[tuple[Belief, Belief, Tensor]]:
     """The belief before and after each adaptation, and which robots it began anew for."""
     for i in steps:
-        before = agent._state_of(len(situations)).belief
+        before = agent.state_of(len(situations)).belief
         tell(agent, data, situations, range(i, i + 1))
         if agent.belief.adaptations > before.adaptations:
             yield before, agent.belief, memory(agent).weight.sum(dim=1) <= WINDOW

@@ -266,7 +266,7 @@ def test_action_is_remembered_as_the_robot_applied_it(quick_agent: FAMLE, make_e
     robot = FAMLEWrapper(make_env(), quick_agent)
     robot.reset(seed=0)
     robot.step(np.array([100.0, -100.0, 0.5, 0.0, 1.0]))
-    np.testing.assert_array_equal(quick_agent._live.memory.action[0, -1].numpy(), [1.0, -1.0, 0.5, 0.0, 1.0])
+    np.testing.assert_array_equal(quick_agent.state_of(1).memory.action[0, -1].numpy(), [1.0, -1.0, 0.5, 0.0, 1.0])
 
 
 def test_agent_without_an_environment_says_what_to_do(make_env: MakeEnv) -> None:

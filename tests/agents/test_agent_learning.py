@@ -80,7 +80,7 @@ def test_robots_learn_from_the_last_transition_of_an_episode(quick_agent: FAMLE)
         return True
 
     quick_agent.learn(2 * 6, callback=note)
-    memory = quick_agent._state_of(2).memory
+    memory = quick_agent.state_of(2).memory
     assert memory.seen == 6
     assert [i for i, _ in ends] == [0, 1, 0]
     for (robot, terminal), age in zip(ends, (4, 2, 1), strict=True):

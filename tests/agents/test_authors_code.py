@@ -254,11 +254,11 @@ def test_predictions_are_bounded_from_the_first_adaptation_on(data: Transitions,
     far, action, two = torch.full((2 * members, 1, 12), 5.0), torch.zeros(2 * members, 1, 5), [0, 7]
     for i in range(EPISODE):
         agent.observe(data.obs[two, i], data.action[two, i], data.next_obs[two, i])
-        state = agent._state_of(2)
+        state = agent.state_of(2)
         free = agent.model.simulator(state.belief.theta, state.belief.h)(far, action)
         assert torch.equal(agent.adapter.model_for(state.belief, state.memory)(far, action), free)
     agent.begin_episode()
-    state = agent._state_of(2)
+    state = agent.state_of(2)
     seen = torch.from_numpy(np.concatenate([data.obs[two, :EPISODE], data.next_obs[two, :EPISODE]], axis=1))
     for sign in (-1.0, 1.0):
         reached = agent.adapter.model_for(state.belief, state.memory)(sign * far, action).view(2, members, 12)
@@ -316,7 +316,7 @@ def test_plans_for_the_square_of_the_distance(
     goal = (0.5, 0.5) if origin == "another robot" else (-1.0, 1.0)
     obs, action, next_obs = (torch.from_numpy(values[0]) for values in (data.obs, data.action, data.next_obs))
     expected = torch.exp(-(next_obs[:, 10:] - torch.tensor(goal)).square().sum(dim=-1))
-    torch.testing.assert_close(agent._unit_reward_fn()(obs, action, next_obs), expected)
+    torch.testing.assert_close(agent.unit_reward_fn()(obs, action, next_obs), expected)
 
 
 def test_other_modes_plan_for_the_distance(load: Load, asked: list[str]) -> None:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from famle_agent import FAMLE, FAMLEWrapper, NotLearnedError, Transitions
-from famle_agent.agents.checkpoint import _box_from_json, _box_to_json, read_checkpoint, write_checkpoint
+from famle_agent.agents.checkpoint import box_from_json, box_to_json, read_checkpoint, write_checkpoint
 from famle_envs.reacher import ReacherEnv
 
 Load = Callable[..., FAMLE]
@@ -248,4 +248,4 @@ def test_spaces_survive(values: tuple[str, Any], infinite: list[bool]) -> None:
     high = low + 1
     low, high = np.where(infinite[: len(low)], -np.inf, low), np.where(infinite[: len(low)][::-1], np.inf, high)
     space = spaces.Box(low.astype(dtype), high.astype(dtype), dtype=np.dtype(dtype).type)
-    assert _box_from_json(json.loads(json.dumps(_box_to_json(space)))) == space
+    assert box_from_json(json.loads(json.dumps(box_to_json(space)))) == space

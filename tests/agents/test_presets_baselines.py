@@ -51,7 +51,7 @@ def test_rivals_have_settings_of_their_own(make_env: Callable[..., Any], robot: 
         for mode in ("ours", "paper"):
             tuned = entry.rivals[mode].get(rival, {})
             settings = settings_of(rival, env, mode)
-            assert settings == entry.hyperparameters(mode, **{**tuned, **cls._implied, **own})
+            assert settings == entry.hyperparameters(mode, **{**tuned, **cls.implied, **own})
         tuned = entry.rivals["ours"][rival]
         assert tuned
         defaults = {name: getattr(Hyperparameters(), name) for name in tuned}

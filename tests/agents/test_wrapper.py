@@ -138,7 +138,7 @@ def test_environment_may_reuse_its_observation(quick_agent: FAMLE, make_env: Mak
     obs, _ = env.reset(seed=0)
     first = obs.copy()
     env.step(np.ones(5))
-    memory = quick_agent._live.memory
+    memory = quick_agent.state_of(1).memory
     np.testing.assert_array_equal(memory.obs[0, -1], first)
     assert not np.array_equal(memory.next_obs[0, -1], first)
 

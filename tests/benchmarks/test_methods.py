@@ -209,7 +209,7 @@ def test_stopped_meta_training_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path
     monkeypatch.setattr(simulation, "Progress", partial(Progress, every=0.0))
     recipe, task = MetaTrained("paper", FAMLE, "paper"), task_of(0, tmp_path / "stopped")
     whole = recipe.learn(task_of(0, tmp_path / "whole"))
-    log, iterations = ModelBasedAgent._log_iteration, list[int]()
+    log, iterations = ModelBasedAgent.log_iteration, list[int]()
 
     def log_iteration(self: ModelBasedAgent, *args: Any) -> bool:
         iterations.append(self.num_timesteps)
@@ -217,7 +217,7 @@ def test_stopped_meta_training_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path
             raise KeyboardInterrupt
         return log(self, *args)
 
-    monkeypatch.setattr(ModelBasedAgent, "_log_iteration", log_iteration)
+    monkeypatch.setattr(ModelBasedAgent, "log_iteration", log_iteration)
     with pytest.raises(KeyboardInterrupt):
         recipe.learn(task)
     assert torch.equal(network_of(recipe.learn(task)), network_of(whole))
@@ -226,7 +226,7 @@ def test_stopped_meta_training_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path
 
 
 def test_replicates_share_one_network_where_one_is_shipped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(methods, "_is_shipped", lambda robot: True)
+    monkeypatch.setattr(methods, "is_shipped", lambda robot: True)
     recipe = MetaTrained("alone", AMPC)
     one, other = (recipe.agent(task_of(seed, tmp_path)) for seed in (0, 1))
     assert one.model.members == 1

@@ -56,20 +56,20 @@ def settle(env: AntEnv) -> Array:
 
 
 def place_of(env: AntEnv) -> Array:
-    return np.array(pybullet.getBasePositionAndOrientation(env._robot, physicsClientId=env._client)[0])
+    return np.array(pybullet.getBasePositionAndOrientation(env.robot, physicsClientId=env.client)[0])
 
 
 def put(env: AntEnv, place: tuple[float, float, float], quaternion: tuple[float, ...] = LEVEL) -> None:
-    pybullet.resetBasePositionAndOrientation(env._robot, place, quaternion, physicsClientId=env._client)
+    pybullet.resetBasePositionAndOrientation(env.robot, place, quaternion, physicsClientId=env.client)
 
 
 def push(env: AntEnv, speed: float) -> None:
-    pybullet.resetBaseVelocity(env._robot, (speed, 0, 0), (0, 0, 0), physicsClientId=env._client)
+    pybullet.resetBaseVelocity(env.robot, (speed, 0, 0), (0, 0, 0), physicsClientId=env.client)
 
 
 def momenta(env: AntEnv) -> Array:
     """Of the torso and of each link, (9, 3)."""
-    robot, client = env._robot, env._client
+    robot, client = env.robot, env.client
     velocities = [pybullet.getBaseVelocity(robot, physicsClientId=client)[0]]
     masses = [pybullet.getDynamicsInfo(robot, -1, physicsClientId=client)[0]]
     for link in JOINTS:
@@ -84,7 +84,7 @@ def momenta(env: AntEnv) -> Array:
 
 def test_observation_is_the_state_of_the_simulator_in_the_documented_order(make: Make) -> None:
     env = make()
-    robot, client = env._robot, env._client
+    robot, client = env.robot, env.client
     for action in commands(40):
         obs = env.step(action)[0]
         place, quaternion = pybullet.getBasePositionAndOrientation(robot, physicsClientId=client)
@@ -112,7 +112,7 @@ def test_velocities_are_those_at_which_the_measured_positions_change(make: Make)
 
 def test_legs_are_front_left_back_left_back_right_and_front_right(make: Make) -> None:
     env = make()
-    feet = [pybullet.getLinkState(env._robot, joint, physicsClientId=env._client)[0] for joint in (1, 3, 5, 7)]
+    feet = [pybullet.getLinkState(env.robot, joint, physicsClientId=env.client)[0] for joint in (1, 3, 5, 7)]
     np.testing.assert_array_equal(np.sign(feet)[:, :2], [[1, 1], [-1, 1], [-1, -1], [1, -1]])
 
 
@@ -136,7 +136,7 @@ def test_ant_without_torque_comes_to_rest_above_the_height_of_a_fall(make: Make)
 def test_torques_within_the_robot_move_it_as_a_whole_hardly(make: Make) -> None:
     env = make()
     put(env, (0, 0, 5))
-    pybullet.setGravity(0, 0, 0, physicsClientId=env._client)
+    pybullet.setGravity(0, 0, 0, physicsClientId=env.client)
     totals, exchanged = [], []
     for action in 0.3 * np.sign(commands()):
         env.step(action)

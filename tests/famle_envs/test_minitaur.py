@@ -51,7 +51,7 @@ def shank_ends(env: GaitEnv) -> Array:
     ends = []
     for motors in np.reshape(env.joints, (4, 2)).tolist():
         for motor, end in zip(motors, CLOSURE, strict=True):
-            state = pybullet.getLinkState(env._robot, motor + 2, physicsClientId=env._client)
+            state = pybullet.getLinkState(env.robot, motor + 2, physicsClientId=env.client)
             ends.append(pybullet.multiplyTransforms(*state[:2], end, (0, 0, 0, 1))[0])
     return np.reshape(ends, (4, 2, 3))
 
@@ -112,7 +112,7 @@ def test_observation_is_the_place_and_the_orientation_of_the_body(make: Make) ->
         obs, *_ = env.step(action)
         assert obs in env.observation_space
         np.testing.assert_allclose(obs[:3], env.position, rtol=1e-6)
-        quaternion = pybullet.getBasePositionAndOrientation(env._robot, physicsClientId=env._client)[1]
+        quaternion = pybullet.getBasePositionAndOrientation(env.robot, physicsClientId=env.client)[1]
         missed = Rotation.from_euler("xyz", obs[3:]).inv() * Rotation.from_quat(quaternion)
         assert missed.magnitude() == pytest.approx(0.0, abs=1e-5)
 

@@ -104,12 +104,12 @@ def test_blocked_joint_is_held_by_more_than_its_motor(make: Make) -> None:
 
 def decay(env: GaitEnv) -> float:
     """How fast a hip without a motor loses its speed in weightlessness, in 1/s."""
-    world = {"physicsClientId": env._client}
+    world = {"physicsClientId": env.client}
     pybullet.setGravity(0.0, 0.0, 0.0, **world)
     put(env, (0.0, 0.0, 5.0))
     for joint in env.joints:
-        pybullet.setJointMotorControl2(env._robot, joint, pybullet.VELOCITY_CONTROL, force=0.0, **world)
-    pybullet.resetJointState(env._robot, HIP, 0.0, 2.0, **world)
+        pybullet.setJointMotorControl2(env.robot, joint, pybullet.VELOCITY_CONTROL, force=0.0, **world)
+    pybullet.resetJointState(env.robot, HIP, 0.0, 2.0, **world)
     pybullet.stepSimulation(**world)
     return math.log(2.0 / joint_speeds(env)[HIP]) / env.time_step
 

@@ -72,7 +72,7 @@ def test_gradient_is_that_of_the_adapted_loss() -> None:
     h = model.embeddings_of(torch.zeros(4, dtype=torch.long))
 
     def adapted_loss(maml: MAML, theta: Theta) -> torch.Tensor:
-        theta_tilde, _ = maml._adapt(model, expand(theta, 4), h, support, INNER_LOOP)
+        theta_tilde, _ = maml.adapt(model, expand(theta, 4), h, support, INNER_LOOP)
         return model.loss(theta_tilde, h, query).mean()
 
     def slope(maml: MAML) -> float:
@@ -96,7 +96,7 @@ def test_inner_steps_and_their_judgement_see_different_transitions_of_the_same_s
     serial = torch.arange(n * points, dtype=torch.float32).view(n, points, 1)
     data = Batch(serial, serial, torch.ones(n, points))
     c = torch.tensor([4, 1, 3])
-    support, query = SETTINGS._sample(data, c, torch.Generator().manual_seed(0))
+    support, query = SETTINGS.sample(data, c, torch.Generator().manual_seed(0))
     for row, situation in enumerate(c.tolist()):
         seen = torch.cat([support.x[row], query.x[row]]).flatten()
         assert sorted(seen.tolist()) == serial[situation].flatten().tolist()
@@ -178,7 +178,7 @@ def test_gradient_of_each_member_is_shortened_by_itself() -> None:
     for value in model.theta.values():
         value.grad = (lengths / count**0.5).view(-1, *[1] * (value.ndim - 1)).expand_as(value).clone()
     before = {name: value.grad.clone() for name, value in model.theta.items()}
-    replace(SETTINGS, max_grad_norm=1.0)._shorten_gradients(model)
+    replace(SETTINGS, max_grad_norm=1.0).shorten_gradients(model)
     for member, factor in enumerate((1.0, 1 / 2, 1 / 30)):
         for name, value in model.theta.items():
             torch.testing.assert_close(value.grad[member], factor * before[name][member], rtol=1e-4, atol=0.0)

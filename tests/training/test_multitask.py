@@ -107,7 +107,7 @@ def test_steps_become_smaller_in_the_second_half() -> None:
 def test_minibatch_is_drawn_from_all_situations_and_differs_between_members() -> None:
     serial = torch.arange(4 * 50, dtype=torch.float32).view(4, 50, 1)
     data = Batch(serial, -serial, torch.ones(4, 50))
-    c, batch = TRAINING._sample(data, 3, torch.Generator().manual_seed(0))
+    c, batch = TRAINING.sample(data, 3, torch.Generator().manual_seed(0))
     assert c.shape == (3, 64)
     assert set(c.flatten().tolist()) == {0, 1, 2, 3}
     assert torch.equal(batch.x[..., 0] // 50, c.float())  # the transitions are of these situations

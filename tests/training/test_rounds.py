@@ -77,13 +77,13 @@ def stored(folder: Path, round_: int) -> list[Transitions]:
 def watch(agent: FAMLE, monkeypatch: pytest.MonkeyPatch) -> list[Transitions]:
     """All transitions that each round learns from."""
     seen: list[Transitions] = []
-    begin = agent._begin_model
+    begin = agent.begin_model
 
     def begin_model(transitions: Transitions, new: bool) -> Any:
         seen.append(transitions)
         return begin(transitions, new)
 
-    monkeypatch.setattr(agent, "_begin_model", begin_model)
+    monkeypatch.setattr(agent, "begin_model", begin_model)
     return seen
 
 
@@ -131,14 +131,14 @@ def test_rounds_plan_for_the_reward(make_agent: Make, monkeypatch: pytest.Monkey
 
 def test_model_goes_on_from_round_to_round(make_agent: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     agent, models = make_agent(joint_lr=0.0, joint_embedding_lr=0.0, meta_iterations=0), list[Dynamics]()
-    learn = agent._begin_model
+    learn = agent.begin_model
 
     def begin_model(*args: Any) -> Any:
         model, data = learn(*args)
         models.append(model)
         return model, data
 
-    monkeypatch.setattr(agent, "_begin_model", begin_model)
+    monkeypatch.setattr(agent, "begin_model", begin_model)
     agent.meta_learn(SITUATIONS)
     assert models[0] is models[1] is models[2]
     fresh = make_agent(joint_lr=0.0, joint_embedding_lr=0.0, meta_iterations=0, rounds=0).meta_learn(SITUATIONS)
@@ -149,14 +149,14 @@ def test_model_goes_on_from_round_to_round(make_agent: Make, monkeypatch: pytest
 
 def test_last_round_may_begin_anew(make_agent: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     agent = make_agent(restart_last_round=True, joint_lr=0.0, joint_embedding_lr=0.0, meta_iterations=0)
-    models, learn = list[Dynamics](), agent._begin_model
+    models, learn = list[Dynamics](), agent.begin_model
 
     def begin_model(*args: Any) -> Any:
         model, data = learn(*args)
         models.append(model)
         return model, data
 
-    monkeypatch.setattr(agent, "_begin_model", begin_model)
+    monkeypatch.setattr(agent, "begin_model", begin_model)
     agent.meta_learn(SITUATIONS)
     assert models[0] is models[1] is not models[2]
     assert not torch.equal(models[2].embeddings, models[0].embeddings)
@@ -201,14 +201,14 @@ def test_reward_that_is_learned_judges_the_plans_of_a_round() -> None:
     agent.meta_learn([lambda g=g: gym.make("Pendulum-v1", g=g) for g in (3.0, 10.0)])
     policy = agent.planning_policy()(agent.get_env().envs[0], 0, np.random.default_rng(0))
     seen: list[torch.Tensor] = []
-    original = type(agent._learned_reward).forward
+    original = type(agent.learned_reward).forward
 
     def forward(self: Any, obs: torch.Tensor, action: torch.Tensor, next_obs: torch.Tensor) -> torch.Tensor:
         seen.append(action)
         return original(self, obs, action, next_obs)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(type(agent._learned_reward), "forward", forward)
+        patch.setattr(type(agent.learned_reward), "forward", forward)
         action = policy(np.array([1.0, 0.0, 0.0], np.float32), True)
     assert seen
     assert 0.9 < torch.cat([value.flatten() for value in seen]).abs().max() <= 1.0 + 1e-6
