@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 
-from benchmarks.harness import write_whole
 from benchmarks.reporting.looks import in_order, look
+from benchmarks.reporting.statistics import FEWEST
 from benchmarks.reporting.study import Study
 from benchmarks.reporting.tables import Row, figures
 
-__all__ = ["headline", "insert"]
+__all__ = ["headline"]
 
 METHODS = (
     *("famle", "ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml", "ppo", "ppo-pretrained", "informed", "oracle"),
@@ -27,6 +25,8 @@ def _median(row: Row, study: Study) -> str:
     key = study.measures[0].key
     low, median, high = (row[f"{key}_{name}"] for name in ("low", "median", "high"))
     decimals = 0 if abs(median) >= 100 else 1
+    if row["replicates"] < FEWEST:
+        return f"{median:.{decimals}f}"
     return f"{median:.{decimals}f} ({low:.{decimals}f} to {high:.{decimals}f})"
 
 
@@ -54,8 +54,6 @@ COLUMNS: Sequence[tuple[str, str, Callable[[Row, Study], str]]] = (
 )
 """The experiment, the heading and the cell of each column; experiments without results have none."""
 
-_BLOCK = re.compile(r"(<!-- report -->\n).*?(<!-- end of report -->)", re.DOTALL)
-
 
 def headline(studies: Sequence[Study]) -> str:
     """The table in Markdown: a row a method, a column an experiment."""
@@ -77,17 +75,3 @@ def headline(studies: Sequence[Study]) -> str:
 def _replicates(rows: Mapping[str, Row]) -> str:
     counts = [row["replicates"] for method, row in rows.items() if method in METHODS]
     return f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else str(counts[0])
-
-
-def insert(table: str, readme: Path) -> None:
-    """Puts the table between the marks of a text, in place of what stood there.
-
-    Raises:
-        ValueError: The text has no marks.
-    """
-    text = readme.read_text()
-    if not _BLOCK.search(text):
-        raise ValueError(
-            f"{readme} has no place for the table: a line <!-- report -->, and one <!-- end of report -->."
-        )
-    write_whole(readme, _BLOCK.sub(lambda marks: f"{marks[1]}{table}\n{marks[2]}", text).encode())

@@ -13,7 +13,7 @@ from rich.markdown import Markdown
 
 from benchmarks.harness import write_whole
 from benchmarks.reporting.board import write_board
-from benchmarks.reporting.headline import headline, insert
+from benchmarks.reporting.headline import headline
 from benchmarks.reporting.markdown import document, section
 from benchmarks.reporting.pictures import draw, draw_paths, draw_times
 from benchmarks.reporting.registry import EXPERIMENTS, experiment_in
@@ -37,15 +37,13 @@ class Report:
     """Folder of the report."""
     tensorboard: Path | None = None
     """Folder for TensorBoard, where methods can be laid over each other; by default there is none."""
-    readme: Path | None = None
-    """A text whose block between the marks of the report gets the table of all robots."""
 
     def __call__(self) -> None:
         """Reads, counts, draws, and then writes.
 
         Raises:
             FileNotFoundError: There are no results.
-            ValueError: A stored result is damaged, or the text has no marks.
+            ValueError: A stored result is damaged.
         """
         found = {experiment: read_study(experiment, self.results) for experiment in EXPERIMENTS}
         studies = [study for study in found.values() if study is not None]
@@ -60,8 +58,6 @@ class Report:
         texts = _texts(studies, more, missing, self._unknown())
         for name, content in {**_pictures(studies), **pictures, **texts}.items():
             write_whole(self.out / name, content)
-        if self.readme is not None:
-            insert(headline(studies), self.readme)
         if self.tensorboard is not None:
             write_board(studies, self.tensorboard)
         Console().print(f"{self.out / 'report.md'}: {len(studies)} of {len(EXPERIMENTS)} experiments.")

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from scipy import stats
 
 __all__ = [
+    "FEWEST",
     "Array",
     "first_crossing",
     "interquartile_mean",
@@ -26,7 +27,7 @@ Interval = tuple[float, float] | None
 """A 95 % interval; None where there are too few replicates for one."""
 
 _RESAMPLES = 2000
-_FEWEST = 5
+FEWEST = 5
 """Replicates that an interval needs: of fewer, the bootstrap's is far too narrow."""
 
 
@@ -59,7 +60,7 @@ def interquartile_mean(values: Sequence[float] | Array) -> tuple[float, Interval
     """The mean of the middle half and its bootstrap interval, which fewer than five replicates do not have."""
     data = np.asarray(values, dtype=np.float64)
     mean = float(stats.trim_mean(data, 0.25))
-    if len(data) < _FEWEST:
+    if len(data) < FEWEST:
         return mean, None
     if np.ptp(data) == 0.0:
         return mean, (mean, mean)
@@ -108,7 +109,7 @@ def probability_of_improvement(
         raise ValueError("Both groups need a replicate to be compared.")
     wins = _pairs_won if paired else _wins
     p = float(wins(*groups))
-    if (n := min(len(group) for group in groups)) < _FEWEST:
+    if (n := min(len(group) for group in groups)) < FEWEST:
         return p, None
     if p in (0.0, 1.0):
         exact = stats.binomtest(round(p * n), n).proportion_ci(0.95)
