@@ -1,4 +1,4 @@
-"""The Minitaur in its reality: the paper's table II.
+"""The Minitaur on held-out dynamics: the paper's table II.
 
 python -m benchmarks.minitaur                     # 60 gaits outside the simulator
 python -m benchmarks.minitaur --experiment home   # the same in the default simulator
@@ -18,26 +18,26 @@ from benchmarks.harness import Options
 from benchmarks.reporting.report import show
 from benchmarks.task import Task
 from famle_envs import Situation
-from famle_envs.minitaur import REALITY
+from famle_envs.minitaur import HELD_OUT
 
 RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
 DEFAULT_METHODS = {
-    "reality": ("famle", "famle-frozen", "famle-nearest", "famle-likeliest", *RIVALS, "one-simulator", "oracle"),
+    "held-out": ("famle", "famle-frozen", "famle-nearest", "famle-likeliest", *RIVALS, "one-simulator", "oracle"),
     "home": ("one-simulator", "famle-frozen", "famle"),
 }
 
 
 @dataclass(frozen=True)
 class Args(Options):
-    """The Minitaur in its reality: the paper's table II."""
+    """The Minitaur on held-out dynamics: the paper's table II."""
 
-    experiment: Literal["reality", "home"] = "reality"
+    experiment: Literal["held-out", "home"] = "held-out"
     """Where the robot walks."""
 
 
 def task_of(experiment: str, seed: int, args: Args) -> Task:
     """The test robot of a replicate; intact, but for its profile."""
-    profile = "simulator" if experiment == "home" else REALITY.name
+    profile = "simulator" if experiment == "home" else HELD_OUT.name
     return Task("minitaur", seed, Situation(), args.cache, profile)
 
 

@@ -11,7 +11,7 @@ import gymnasium as gym
 import famle_envs  # noqa: F401 (registers the robots)
 from famle_agent.agents.presets import known_robots
 from famle_envs import Situation
-from famle_envs.reality import Profile
+from famle_envs.profile import Profile
 
 __all__ = ["Task"]
 

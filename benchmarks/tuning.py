@@ -27,9 +27,9 @@ from benchmarks.reporting.registry import experiment_in
 from benchmarks.task import Task
 from famle_envs import Situation
 from famle_envs.ant import AntEnv
+from famle_envs.profile import Profile
 from famle_envs.quadruped import LEGS, blocked_leg
 from famle_envs.reacher import ReacherEnv
-from famle_envs.reality import Profile
 
 YAW = math.radians(40)
 

@@ -13,7 +13,7 @@ from gymnasium import spaces
 
 from famle_envs.bullet_env import HOLDING_FORCE, Array, BulletEnv
 from famle_envs.gaits import GAIT_DIM, trot
-from famle_envs.reality import SIMULATOR, Profile, resolve_profile
+from famle_envs.profile import SIMULATOR, Profile, resolve_profile
 from famle_envs.situation import Situation
 
 __all__ = ["GaitEnv"]
@@ -25,7 +25,7 @@ class GaitEnv(BulletEnv):
     """Base of the robots that walk one gait a second. Between two actions the robot walks on; nothing is reset.
 
     Args:
-        profile: What the body is beside its situation: ``"simulator"``, ``"reality"``, a :class:`Profile` or a mapping
+        profile: What the body is beside its situation: ``"simulator"``, ``"held-out"``, a :class:`Profile` or a mapping
             of its fields. Agents are trained on the simulator only.
         situation: See :class:`BulletEnv`.
         render_mode: See :class:`BulletEnv`.

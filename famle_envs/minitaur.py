@@ -14,10 +14,10 @@ from gymnasium import spaces
 
 from famle_envs.bullet_env import Array
 from famle_envs.gait_env import GaitEnv, wrapped
-from famle_envs.reality import SIMULATOR, Profile
+from famle_envs.profile import SIMULATOR, Profile
 from famle_envs.situation import Situation
 
-__all__ = ["REALITY", "MinitaurEnv"]
+__all__ = ["HELD_OUT", "MinitaurEnv"]
 
 _MOTORS = (23, 20, 17, 14, 1, 4, 7, 10)  # PyBullet's indices: right and left motor of each leg
 _KNEE_OF_MOTOR = 2  # its index beyond the motor's
@@ -30,8 +30,8 @@ _CLOSURE = ((0.0, 0.005, 0.2), (0.0, 0.01, 0.2))  # where the two shanks of a le
 _START_HEIGHT = 0.19
 _FALLEN_TILT = math.cos(math.radians(50))
 
-REALITY = Profile(
-    name="reality",
+HELD_OUT = Profile(
+    name="held-out",
     motor_strength=0.6,
     motor_speed=0.8,
     joint_damping=0.02,
@@ -103,7 +103,7 @@ class MinitaurEnv(GaitEnv):
     motor_speed = 6.0
     position_gain = 0.05
     rest_angles = _REST * np.repeat(_LEG_SIDE, 2)
-    profiles: ClassVar[Mapping[str, Profile]] = {REALITY.name: REALITY}
+    profiles: ClassVar[Mapping[str, Profile]] = {HELD_OUT.name: HELD_OUT}
     angle_dims = (3, 4)
     pose_dims = (0, 1, 5)
     training_situations = _TRAINING

@@ -13,10 +13,10 @@ from gymnasium import spaces
 from famle_envs.arguments import finite_point, number_within
 from famle_envs.bullet_env import Array
 from famle_envs.gait_env import GaitEnv
-from famle_envs.reality import SIMULATOR, Profile
+from famle_envs.profile import SIMULATOR, Profile
 from famle_envs.situation import Situation
 
-__all__ = ["LEGS", "REALITY", "QuadrupedEnv"]
+__all__ = ["HELD_OUT", "LEGS", "QuadrupedEnv"]
 
 LEGS = ("back left", "front left", "front right", "back right")
 _JOINTS_OF_A_LEG = 3
@@ -25,8 +25,8 @@ _FULL_SWING = math.pi / 4  # of a joint, where the gait says 1 (rad)
 _BACKWARDS = np.array([1.0, 1.0, -1.0, -1.0])  # sense in which a hip turns its leg backwards
 _START_HEIGHT = 0.142
 
-REALITY = Profile(
-    name="reality",
+HELD_OUT = Profile(
+    name="held-out",
     motor_strength=0.03,
     motor_speed=0.4,
     joint_damping=0.02,
@@ -96,7 +96,7 @@ class QuadrupedEnv(GaitEnv):
 
     Example:
         >>> import gymnasium as gym, famle_envs
-        >>> env = gym.make("FamleQuadruped-v0", situation="front left leg blocked", profile="reality")
+        >>> env = gym.make("FamleQuadruped-v0", situation="front left leg blocked", profile="held-out")
         >>> obs, info = env.reset(seed=0)
         >>> info["is_success"]
         False
@@ -109,7 +109,7 @@ class QuadrupedEnv(GaitEnv):
     motor_torque = 30.0
     motor_speed = 7.0
     rest_angles = np.zeros(_N_JOINTS)
-    profiles: ClassVar[Mapping[str, Profile]] = {REALITY.name: REALITY}
+    profiles: ClassVar[Mapping[str, Profile]] = {HELD_OUT.name: HELD_OUT}
     pose_dims = (0, 1, 2, 3)
     task_arguments = GaitEnv.task_arguments | {"goal", "success_radius"}
     training_situations = _TRAINING

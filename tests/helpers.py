@@ -26,8 +26,8 @@ from famle_agent.models.dynamics import Dynamics, Theta
 from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.models.observation import DIMS, ObservationLayout
 from famle_envs.gait_env import GaitEnv
+from famle_envs.profile import Profile
 from famle_envs.quadruped import QuadrupedEnv
-from famle_envs.reality import Profile
 
 Array = npt.NDArray[Any]
 

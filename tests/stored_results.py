@@ -41,7 +41,7 @@ def store_walks(results: Path, method: str, ways: Sequence[Sequence[float]]) -> 
     """Stores walks by their x, one a seed."""
     for seed, xs in enumerate(ways):
         figures = {"gaits": len(xs) - 1, "distance": xs[-1], "path": [[x, 0.0] for x in xs], "fell": False}
-        store(results, "minitaur-reality", method, seed, ms_per_plan=5.0, **figures)
+        store(results, "minitaur-held-out", method, seed, ms_per_plan=5.0, **figures)
 
 
 def store_runs(results: Path, method: str, returns: Sequence[float], folder: str = "ant-unseen") -> None:

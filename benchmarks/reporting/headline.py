@@ -50,7 +50,7 @@ COLUMNS: Sequence[tuple[str, str, Callable[[Row, Study], str]]] = (
     ("quadruped-yaw", "quadruped, yaw error: success, gaits", _gaits),
     ("quadruped-leg", "... a leg blocked", _gaits),
     ("quadruped-both", "... both", _gaits),
-    ("minitaur-reality", "Minitaur: metres in 60 gaits", _median),
+    ("minitaur-held-out", "Minitaur: metres in 60 gaits", _median),
 )
 """The experiment, the heading and the cell of each column; experiments without results have none."""
 

@@ -237,10 +237,10 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     ),
     _quadruped("later", "the yaw error strikes after five gaits, which count too", _SHIPPED),
     _quadruped("gap-home", "intact, in its simulator", _SHIPPED, picture="quadruped-gap"),
-    _quadruped("gap-reality", "intact, in its reality", _SHIPPED, picture="quadruped-gap"),
+    _quadruped("gap-held-out", "intact, on held-out dynamics", _SHIPPED, picture="quadruped-gap"),
     _minitaur(
-        "reality",
-        "in its reality (table II)",
+        "held-out",
+        "on held-out dynamics (table II)",
         (
             Published("FAMLE", distance=4.8, time=60.0),
             Published("AMPC-MAML", distance=1.6, time=90.0, famle_faster_by=0.5),

@@ -21,7 +21,7 @@ __all__ = ["main"]
 
 @dataclass(frozen=True)
 class Demo:
-    """Break a robot and watch it adapt: arm and ant in simulation, quadruped and Minitaur in their reality."""
+    """Break a robot and watch it adapt: arm and ant in simulation, quadruped and Minitaur on held-out dynamics."""
 
     robot: Literal["reacher", "ant", "quadruped", "minitaur"] = "reacher"
     """The robot."""

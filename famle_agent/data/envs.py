@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from famle_agent.data.policies import reward_names
 from famle_agent.data.transitions import EnvSource
 from famle_agent.planning import RewardFn
-from famle_envs.reality import Profile
+from famle_envs.profile import Profile
 from famle_envs.situation import Situation
 
 __all__ = [

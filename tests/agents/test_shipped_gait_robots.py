@@ -28,8 +28,8 @@ def test_package_ships_a_small_model_of_these_settings(robot: str, n_situations:
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_shipped_model_serves_a_robot_in_reality(robot: str, make_env: MakeEnv) -> None:
-    env = make_env(known_robots()[robot].env_id, profile="reality")
+def test_shipped_model_serves_held_out_dynamics(robot: str, make_env: MakeEnv) -> None:
+    env = make_env(known_robots()[robot].env_id, profile="held-out")
     assert FAMLE(env, device="cpu").dynamics is not None
 
 
@@ -46,18 +46,18 @@ def test_shipped_model_serves_any_goal(make_env: MakeEnv) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("situation", ["back right leg blocked", "yaw sensor off by 30 deg"])
-def test_quadruped_reaches_its_goal_in_reality(situation: str, make_env: MakeEnv) -> None:
+def test_quadruped_reaches_its_goal_on_held_out_dynamics(situation: str, make_env: MakeEnv) -> None:
     agent = FAMLE("quadruped", seed=0, device="cpu")
     agent.get_env().close()
-    env = make_env("FamleQuadruped-v0", situation=situation, profile="reality")
+    env = make_env("FamleQuadruped-v0", situation=situation, profile="held-out")
     assert rollout(FAMLEWrapper(env, agent), seed=0).success
 
 
 @pytest.mark.slow
-def test_minitaur_walks_in_reality(make_env: MakeEnv) -> None:
+def test_minitaur_walks_on_held_out_dynamics(make_env: MakeEnv) -> None:
     agent = FAMLE("minitaur", seed=0, device="cpu")
     agent.get_env().close()
-    env = make_env("FamleMinitaur-v0", profile="reality", max_episode_steps=20)
+    env = make_env("FamleMinitaur-v0", profile="held-out", max_episode_steps=20)
     run = rollout(FAMLEWrapper(env, agent), seed=0)
     assert not run.fell
     assert run.position[-1, 0] > 2.0

@@ -18,17 +18,17 @@ from famle_envs import Situation
 from famle_envs.quadruped import QuadrupedEnv
 
 
-def test_tests_are_run_in_reality_and_on_damage_that_no_training_situation_has() -> None:
+def test_tests_are_run_on_held_out_dynamics_and_on_damage_that_no_training_situation_has() -> None:
     for experiment in ("yaw", "leg", "both", "later"):
         for seed in range(4):
             task = quadruped.task_of(experiment, seed, quadruped.Args())
-            assert task.profile == "reality"
+            assert task.profile == "held-out"
             test = task.later or task.situation
             assert test not in QuadrupedEnv.training_situations
             assert not test.is_intact
     legs = {quadruped.task_of("leg", seed, quadruped.Args()).situation.locked_joints for seed in range(12)}
     assert legs == {(0, 1, 2), (3, 4, 5), (6, 7, 8), (9, 10, 11)}
-    assert minitaur.task_of("reality", 0, minitaur.Args()).profile == "reality"
+    assert minitaur.task_of("held-out", 0, minitaur.Args()).profile == "held-out"
     assert minitaur.task_of("home", 0, minitaur.Args()).profile == "simulator"
 
 
@@ -39,7 +39,7 @@ def test_replicate_is_stored_with_its_profile_and_summed_up(tmp_path: Path, caps
         run_replicates([Replicate(method, 0, partial(run, method, task))], tmp_path / "quadruped-yaw", jobs=1)
     results = load_results(tmp_path / "quadruped-yaw")
     for result in results:
-        assert result["profile"].startswith("reality: motor_strength 0.03")
+        assert result["profile"].startswith("held-out: motor_strength 0.03")
         assert len(result["path"]) == result["gaits"] + 1
         assert result["distance"] == pytest.approx(result["path"][-1][0], abs=1e-3)
         assert result["reached"] == (np.hypot(2.5 - result["path"][-1][0], result["path"][-1][1]) < 0.25)
@@ -52,7 +52,7 @@ def test_replicate_is_stored_with_its_profile_and_summed_up(tmp_path: Path, caps
 @pytest.mark.parametrize("robot", ["quadruped", "minitaur"])
 @pytest.mark.parametrize("method", ["famle", "famle-frozen", "famle-nearest", "famle-likeliest"])
 def test_methods_are_the_shipped_agent_with_something_changed(robot: str, method: str, tmp_path: Path) -> None:
-    agent: Any = METHODS[method].agent(Task(robot, 3, Situation(), tmp_path, "reality"))
+    agent: Any = METHODS[method].agent(Task(robot, 3, Situation(), tmp_path, "held-out"))
     settings = agent.hyperparameters
     assert agent.dynamics is not None
     assert (settings.adapt_every == 0) == (method == "famle-frozen")

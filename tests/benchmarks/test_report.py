@@ -66,12 +66,12 @@ def test_report_has_a_section_a_picture_and_a_table_for_every_experiment_that_is
     results: Path, arm: Path, ant: Path, quadruped: Path, minitaur: Path
 ) -> None:
     text, out = report(results)
-    ways = ("quadruped-yaw-paths", "minitaur-reality-paths")
-    for name in ("reacher-paper", "ant-unseen", "quadruped", "minitaur-reality", "time", *ways):
+    ways = ("quadruped-yaw-paths", "minitaur-held-out-paths")
+    for name in ("reacher-paper", "ant-unseen", "quadruped", "minitaur-held-out", "time", *ways):
         assert (out / f"{name}.png").read_bytes().startswith(PNG)
         assert f"]({name}.png)" in text
     assert {path.stem for path in out.glob("*.csv")} == {
-        *("reacher-paper", "ant-unseen", "quadruped-yaw", "minitaur-reality", "replicates")
+        *("reacher-paper", "ant-unseen", "quadruped-yaw", "minitaur-held-out", "replicates")
     }
     assert text.count("\n## Arm, the paper's damage") == 1
     assert "- `python -m benchmarks.x --methods famle` at `abc1234`: FAMLE (`famle`)" in text
@@ -187,14 +187,14 @@ def test_distance_is_the_furthest_and_the_time_until_there(minitaur: Path) -> No
     assert table[2:4] == ["5.0", "2"]
     rivals = [row[-1] for row in rows_of(text, "AMPC-MAML, in the paper alone")]
     assert "1.6 m in 90 s, FAMLE about 50 % faster" in rivals
-    assert float(by_name(out / "minitaur-reality.csv")["famle"]["distance_median"]) == 4.5
+    assert float(by_name(out / "minitaur-held-out.csv")["famle"]["distance_median"]) == 4.5
 
 
 def test_famle_s_time_to_where_another_method_gets_stands_beside_it(minitaur: Path) -> None:
     store_walks(minitaur, "ampc", [[0.0, 1.0, 2.0, 3.0]] * 2)
     store_walks(minitaur, "oracle", [[0.0, 4.0, 8.0, 9.0]] * 2)
     text, out = report(minitaur)
-    rows = by_name(out / "minitaur-reality.csv")
+    rows = by_name(out / "minitaur-held-out.csv")
     assert [rows[name]["famle_there_after"] for name in ("ampc", "oracle", "famle")] == ["1.0", "inf", ""]
     assert rows_of(text, "oracle")[0][4] == "never"
 

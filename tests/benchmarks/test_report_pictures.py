@@ -56,7 +56,7 @@ def test_situations_stand_side_by_side_with_failures_and_the_paper_s_means(tmp_p
 
 def test_every_replicate_is_shown_beside_the_interquartile_mean(tmp_path: Path) -> None:
     store_walks(tmp_path, "famle", [[0.0, 1.0], [0.0, 2.0], [0.0, 3.0], [0.0, 10.0]])
-    points, mean, *_ = draw([study_of(tmp_path, "minitaur-reality")]).axes[0].get_lines()
+    points, mean, *_ = draw([study_of(tmp_path, "minitaur-held-out")]).axes[0].get_lines()
     assert sorted(points.get_xdata()) == [1.0, 2.0, 3.0, 10.0]
     assert list(mean.get_xdata()) == [2.5]
 

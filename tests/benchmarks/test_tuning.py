@@ -7,7 +7,7 @@ from benchmarks import tuning
 from benchmarks.harness import load_results
 from benchmarks.tuning import ROBOTS, Args, method_with
 from famle_agent import ModelBasedAgent
-from famle_envs.reality import Profile
+from famle_envs.profile import Profile
 from tests.small_reacher import EPISODE, task_of
 
 

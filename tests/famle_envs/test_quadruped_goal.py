@@ -11,8 +11,8 @@ import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
 
+from famle_envs.profile import Profile
 from famle_envs.quadruped import QuadrupedEnv
-from famle_envs.reality import Profile
 from tests.helpers import making, put, walk
 
 Array = npt.NDArray[Any]
