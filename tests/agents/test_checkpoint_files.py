@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from stable_baselines3 import PPO
 
 import famle_agent.agents.checkpoint
-from famle_agent import FAMLE
+from famle_agent import AMPCMAML, FAMLE
 from famle_agent.agents.checkpoint import read_checkpoint, write_checkpoint
 
 
@@ -192,4 +192,29 @@ def test_file_cannot_make_us_import_anything(
         agent.predict(np.zeros(12, np.float32))
     agent.set_env(gym.make("FamleReacher-v0"))
     assert agent.predict(np.zeros(12, np.float32))[0].shape == (5,)
+    agent.get_env().close()
+
+
+# --- files of earlier versions ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "adaptations", "situation", "action"),
+    [
+        (FAMLE, "famle", 12, "joint 2 reversed", [-0.5158, -0.2944, -0.0092, -0.4479, 0.2613]),
+        (AMPCMAML, "ampc-maml", 5, "every situation", [-0.9359, -0.8440, -0.2028, 0.5484, 0.5406]),
+    ],
+)
+def test_file_of_an_earlier_version_goes_on_as_it_did_there(
+    kind: type[FAMLE | AMPCMAML], name: str, adaptations: int, situation: str, action: list[float]
+) -> None:
+    """Both have lived 25 steps on a robot; the actions were measured with the version that wrote the files."""
+    agent = kind.load(Path(__file__).parent / "files" / f"{name}.zip", device="cpu")
+    assert agent.num_timesteps == 25
+    assert agent.belief.adaptations == adaptations
+    posterior = agent.posterior()
+    assert max(posterior, key=lambda key: posterior[key]) == situation
+    obs = np.linspace(-0.5, 0.5, 12, dtype=np.float32)
+    np.testing.assert_allclose(agent.predict(obs, deterministic=True)[0], action, atol=2e-3)
+    assert agent.learn(10, reset_num_timesteps=False).num_timesteps == 35
     agent.get_env().close()
