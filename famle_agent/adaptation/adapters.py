@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation.belief import Belief, prior
+from famle_agent.adaptation.belief import Belief, prior, unadapted
 from famle_agent.adaptation.candidates import Candidates
 from famle_agent.adaptation.memory import Memory, Sample, minibatches, whole_memory
 from famle_agent.adaptation.posterior import better_explained, filtered_posterior, window_posterior
@@ -135,10 +135,7 @@ class GradientAdapter:
 
     def initial(self, robots: int) -> Belief:
         """Returns theta_meta."""
-        none = torch.zeros(robots, dtype=torch.long, device=self.model.embeddings.device)
-        theta, h = self.model.theta_of(robots), self.model.embeddings_of(none)
-        log_posterior = torch.zeros(robots, 1, device=self.model.embeddings.device)
-        return Belief(theta, h, log_posterior, candidate=none, diverged=none)
+        return unadapted(self.model, torch.zeros(1, device=self.model.embeddings.device), robots)
 
     def log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
         """Returns zeros: there is one model, and nothing to tell apart."""

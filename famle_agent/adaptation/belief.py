@@ -10,7 +10,7 @@ from torch import Tensor
 from famle_agent.adaptation.candidates import Candidates
 from famle_agent.models.dynamics import Batch, Dynamics, Theta
 
-__all__ = ["Belief", "choose", "prior"]
+__all__ = ["Belief", "choose", "prior", "unadapted"]
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,13 @@ class Belief:
 
 def prior(model: Dynamics, candidates: Candidates, robots: int) -> Belief:
     """What B robots believe before they have seen anything: theta_meta, and the first situation's embedding."""
+    return unadapted(model, candidates.log_prior, robots)
+
+
+def unadapted(model: Dynamics, log_prior: Tensor, robots: int) -> Belief:
+    """Returns theta_meta and the first embedding for B robots, with the log prior (C,) of what there is to select."""
     none = torch.zeros(robots, dtype=torch.long, device=model.embeddings.device)
-    log_prior = candidates.log_prior.expand(robots, -1)
+    log_prior = log_prior.expand(robots, -1)
     return Belief(model.theta_of(robots), model.embeddings_of(none), log_prior, candidate=none, diverged=none)
 
 

@@ -372,7 +372,7 @@ class ModelBasedAgent(SimulationLearner):
                 "The agent was made with a reward_fn, which no file can hold: give load(..., reward_fn=...)."
             )
         if (made := stored.make_env() if env is None else make_env(env)) is not None:
-            _check_same_spaces(made, stored)
+            stored.check_spaces(made)
         # All settings are in the file, so that its mode need not be known for this environment.
         settings = {**stored.hyperparameters.to_dict(), **stored.dims, **overrides}
         agent = cls(made, reward_fn=reward_fn, device=device, pretrained=False, **settings)
@@ -413,19 +413,20 @@ class ModelBasedAgent(SimulationLearner):
         differing += [name for name, dims in self.dims.items() if stored.dims[name] != dims]
         differing += stored.hyperparameters.learnt_otherwise(self.hyperparameters)
         if not differing:
-            self.situations = stored.situations
-            self._take_weights(stored)
+            self._take_over(stored.model_alone())
         return differing
 
     def _take_over(self, stored: Checkpoint) -> None:
-        self.situations = stored.situations
+        known = self.situations, self.dynamics, self.learned_reward, self._live
         try:
+            self.situations = stored.situations
             self._take_weights(stored)
             if stored.live is not None:
                 self._live = self._online_state(stored, stored.live)
             if self.device.type == "cpu" and (generator := stored.part("generator")):
                 self.generator.set_state(generator["state"])
         except (KeyError, RuntimeError, TypeError) as error:
+            self.situations, self.dynamics, self.learned_reward, self._live = known  # nothing is half-taken
             raise ValueError(
                 "The file's weights do not fit its settings; it is damaged, or an override changed the network: "
                 f"{error}"
@@ -447,7 +448,14 @@ class ModelBasedAgent(SimulationLearner):
         state = state.resized(settings.memory_size, settings.selection_window, settings.horizon)
         # With other candidates than the stored agent's, what it has seen cannot be judged by what it knew of them.
         begins = self.adapter.initial(state.robots)
-        return state if state.belief.log_posterior.shape == begins.log_posterior.shape else None
+        if state.belief.log_posterior.shape == begins.log_posterior.shape:
+            return state
+        warnings.warn(
+            "What the stored agent believed of its robot is left behind: it told other situations apart than these "
+            "settings do (compose). The agent begins with what it meta-learned.",
+            stacklevel=4,
+        )
+        return None
 
     def _world(self, env: dict[str, Any] | None) -> dict[str, Any] | None:
         """What of an environment's description matters to a model of all its situations."""
@@ -479,14 +487,6 @@ class ModelBasedAgent(SimulationLearner):
     def _to_env(self, action: Tensor) -> Array:
         """From [-1, 1] to the action space."""
         return to_action_space(action, self.action_space)
-
-
-def _check_same_spaces(env: Any, stored: Checkpoint) -> None:
-    if env.observation_space != stored.observation_space or env.action_space != stored.action_space:
-        raise ValueError(
-            f"The environment's spaces, {env.observation_space} and {env.action_space}, are not the agent's, "
-            f"{stored.observation_space} and {stored.action_space}."
-        )
 
 
 def _before_reset(obs: Any, dones: Array, infos: Sequence[Mapping[str, Any]]) -> Array:

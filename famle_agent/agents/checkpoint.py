@@ -7,7 +7,7 @@ import json
 import os
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -178,6 +178,23 @@ class Checkpoint:
         """The tensors of one part of the agent, by name; empty where it has none."""
         prefix = f"{name}/"
         return {key.removeprefix(prefix): value for key, value in self.tensors.items() if key.startswith(prefix)}
+
+    def model_alone(self) -> Checkpoint:
+        """Returns the same with the weights only: no online state, and no random numbers."""
+        weights = {name: value for name, value in self.tensors.items() if name.startswith(("dynamics/", "reward/"))}
+        return replace(self, live=None, tensors=weights)
+
+    def check_spaces(self, env: Any) -> None:
+        """Refuses an environment with other spaces than the agent's.
+
+        Raises:
+            ValueError: The spaces differ.
+        """
+        if env.observation_space != self.observation_space or env.action_space != self.action_space:
+            raise ValueError(
+                f"The environment's spaces, {env.observation_space} and {env.action_space}, are not the agent's, "
+                f"{self.observation_space} and {self.action_space}."
+            )
 
     def make_env(self) -> gym.Env[Any, Any] | None:
         """Makes the environment that the file names, if it is one of ours: another one's arguments might run anything.
