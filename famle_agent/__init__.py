@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from famle_agent.adaptation.controller import OnlineState
     from famle_agent.agents.agent import ModelBasedAgent
     from famle_agent.agents.baselines import AMPC, AMPCMAML
-    from famle_agent.agents.config import Hyperparameters
+    from famle_agent.agents.config import Config
     from famle_agent.agents.famle import FAMLE
     from famle_agent.agents.wrapper import FAMLEWrapper
     from famle_agent.data.transitions import Transitions
@@ -23,8 +23,8 @@ __all__ = [
     "AMPC",
     "AMPCMAML",
     "FAMLE",
+    "Config",
     "FAMLEWrapper",
-    "Hyperparameters",
     "ModelBasedAgent",
     "NotLearnedError",
     "OnlineState",
@@ -37,10 +37,11 @@ __version__ = version("famle")
 _MODULES = {
     "AMPC": "agents.baselines",
     "AMPCMAML": "agents.baselines",
+    "Config": "agents.config",
     "FAMLE": "agents.famle",
     "FAMLEWrapper": "agents.wrapper",
-    "Hyperparameters": "agents.config",
     "ModelBasedAgent": "agents.agent",
+    "Hyperparameters": "agents.config",  # deprecated
     "NotLearnedError": "utils.errors",
     "OnlineState": "adaptation.controller",
     "Transitions": "data.transitions",

@@ -76,8 +76,8 @@ class Planner(ABC):
         candidates: N, sequences judged per iteration.
     """
 
-    horizon: int
-    candidates: int
+    horizon: int = 10
+    candidates: int = 100
 
     @abstractmethod
     def plan(self, judge: Judge, start: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -155,7 +155,7 @@ class MPPI(Planner):
         noise_beta: Exponent of the noise's power spectrum, as for :class:`ICEM`.
     """
 
-    iterations: int = 2
+    iterations: int = 3
     temperature: float = 0.1
     init_std: float = 0.5
     noise_beta: float = 2.0

@@ -5,6 +5,7 @@ State is a value: each call takes one and returns another, as a recurrent policy
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -95,6 +96,12 @@ class Adapter(Protocol):
 
     def model_for(self, belief: Belief, memory: Memory) -> Model:
         """Returns the dynamics that a belief stands for, B * P of them."""
+
+    def posterior(self, belief: Belief, situations: Sequence[str]) -> dict[str, float]:
+        """Returns P(situation | memory) of the first robot by name, given those of the training situations."""
+
+    def marginals(self, belief: Belief, situations: Sequence[str]) -> dict[str, float]:
+        """Returns the same of each training situation, be it alone or a part of what is wrong."""
 
 
 @dataclass(frozen=True)

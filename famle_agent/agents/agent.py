@@ -1,93 +1,369 @@
-"""Living on a robot: adapting and planning all the time, with the face of Stable-Baselines3."""
+"""The face that all our agents share with Stable-Baselines3's algorithms."""
 
 from __future__ import annotations
 
+import os
 import warnings
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from importlib.resources import as_file
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
-from stable_baselines3.common.utils import safe_mean
-from torch import Tensor
+from stable_baselines3.common.utils import check_for_correct_spaces, configure_logger, safe_mean
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from tqdm.auto import tqdm
 from typing_extensions import Self
 
+from famle_agent.adaptation.adapters import EmbeddingAdapter, GradientAdapter
 from famle_agent.adaptation.belief import Belief
 from famle_agent.adaptation.controller import Adapter, Controller, OnlineState
-from famle_agent.adaptation.memory import Memory
-from famle_agent.agents.checkpoint import Checkpoint, File
-from famle_agent.agents.presets import make_env
-from famle_agent.agents.simulation import SimulationLearner
-from famle_agent.agents.tensorboard import log_adaptations, log_posterior
+from famle_agent.agents.checkpoint import Checkpoint, File, joined
+from famle_agent.agents.config import Config
+from famle_agent.agents.meta_training import meta_train, planning_policy, simulate
+from famle_agent.agents.policy import AdaptivePolicy
+from famle_agent.agents.presets import make_env, robot_of
+from famle_agent.agents.tensorboard import log_adaptations, log_embeddings, log_posterior
+from famle_agent.agents.world_model import Interface
 from famle_agent.data.action_scaling import check_action, check_observation, to_action_space
-from famle_agent.data.envs import env_attribute
+from famle_agent.data.envs import (
+    EnvLike,
+    SituationEnvs,
+    check_spaces,
+    env_attribute,
+    env_id,
+    env_spec,
+    planning_reward,
+    situation_envs,
+    special_dims,
+)
+from famle_agent.data.policies import MakePolicy
+from famle_agent.data.transitions import Transitions
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import prepare_torch
-from famle_agent.planning import Planner, RewardFn
-
-if TYPE_CHECKING:
-    from importlib.resources.abc import Traversable
+from famle_agent.planning import RewardFn
+from famle_agent.training.run_folder import RunFolder
 
 __all__ = ["ModelBasedAgent"]
 
 Array = npt.NDArray[Any]
 
 
-class ModelBasedAgent(SimulationLearner):
+class ModelBasedAgent(BaseAlgorithm):
     """An agent that learns a model in simulation, adapts it on the robot, and plans with it.
 
-    Subclasses say how the model is learnt (:meth:`_learn_model`) and what adapts it (:meth:`_new_adapter`). Arguments
-    as for :class:`~famle_agent.agents.algorithm.ModelBasedAlgorithm`.
+    Args:
+        env: A robot's name (``"reacher"``), a Gymnasium id, an environment or a ``VecEnv`` with one robot each.
+        mode: ``"ours"`` for the settings that we found to be best, ``"paper"`` for the paper's, ``"original"`` for
+            those of the authors' public code, where there is some for the robot.
+        reward_fn: r(s, a, s') for torch tensors (..., dim) -> (...), what the planner maximises. None takes the
+            environment's ``planning_reward_fn`` or ``reward_fn``, and where it has neither the reward is learnt with
+            the dynamics.
+        angle_dims: Observation dimensions that are angles in rad. None takes the environment's ``angle_dims`` unless
+            the settings say ``raw_angles``.
+        quaternion_dims: The four observation dimensions of a unit quaternion, or none of them. None takes the
+            environment's ``quaternion_dims``.
+        pose_dims: x, y and heading of a robot on a floor, the heading as an angle or as its sine and its cosine: with
+            them, the model knows that a robot moves alike wherever it stands and looks. None takes the environment's
+            ``pose_dims`` where the settings are ``egocentric``.
+        tensorboard_log: Folder for TensorBoard; None logs nothing there.
+        verbose: 0 for silence, 1 for information, 2 for debugging.
+        device: ``"auto"``, ``"cpu"`` or ``"cuda"``.
+        seed: Seed of everything; the same seed gives the same agent.
+        pretrained: Whether to begin with the meta-learned model that the package ships, where it ships one for this
+            environment and these settings (``"ant"``). :meth:`meta_learn` learns anew all the same.
+        config: All settings, instead of those of a mode.
+        **overrides: Settings to change, by the keywords of :class:`~famle_agent.agents.config.Config`.
+
+    Attributes:
+        policy: What the agent has learnt, and how it acts on it.
+        num_timesteps: Steps that the agent has lived on robots.
+        num_iterations: Iterations of learning in the last meta-training.
+
+    Raises:
+        TypeError: An override is no setting.
+        ValueError: The environment is unknown or its spaces are not supported; a setting is out of range, or has no
+            effect beside the others.
     """
 
-    planner: Planner
+    implied: ClassVar[Mapping[str, Any]] = {}
+    """Settings that the kind of agent implies, in every mode."""
+
+    adapter_class: ClassVar[type[EmbeddingAdapter | GradientAdapter]]
+    """What adapts its model; a gradient adapter has no use for more than one embedding."""
+
+    policy: AdaptivePolicy  # type: ignore[assignment]
+    observation_space: spaces.Box
+    action_space: spaces.Box
     _live: OnlineState | None
-    _served: object
+
+    def __init__(
+        self,
+        env: GymEnv | str | None,
+        mode: str = "ours",
+        *,
+        reward_fn: RewardFn | None = None,
+        angle_dims: Sequence[int] | None = None,
+        quaternion_dims: Sequence[int] | None = None,
+        pose_dims: Sequence[int] | None = None,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        device: torch.device | str = "auto",
+        seed: int | None = None,
+        pretrained: bool = True,
+        config: Config | None = None,
+        **overrides: Any,
+    ) -> None:
+        if env is not None:
+            env = make_env(env)
+            check_spaces(env.observation_space, env.action_space)
+        super().__init__(
+            policy=BasePolicy,
+            env=env,
+            learning_rate=0.0,  # the settings have rates of their own
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            support_multi_env=True,
+            seed=seed,
+        )
+        self.mode, self._env_spec = mode, None if self.env is None else _description(self.env)
+        robot = robot_of(None if self.env is None else env_id(self.env))
+        if config is None:
+            config = robot.config(mode, self._preset(overrides), self._implied(overrides), **overrides)
+        elif overrides:
+            config = config.changed(**overrides)
+        self.policy = AdaptivePolicy(config, self.adapter_class, self.device, reward_fn)
+        self.generator = torch.Generator(self.device)
+        if self.env is not None:
+            given = {"angle_dims": angle_dims, "quaternion_dims": quaternion_dims, "pose_dims": pose_dims}
+            dims = special_dims(self.env, given, config.model.egocentric, config.model.raw_angles)
+            self.policy.robot = Interface(self.observation_space, self.action_space, dims)
+            self._take_reward(self.env)
+        self._setup_model()
+        if pretrained and robot.pretrained is not None:
+            with as_file(robot.pretrained) as file:
+                self.policy.not_taken = self.take_model(file)
+
+    def _preset(self, overrides: Mapping[str, Any]) -> str:
+        """Under which name ``hyperparams/`` has settings that were tuned for this kind of agent; empty for FAMLE."""
+        return ""
+
+    def _implied(self, overrides: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The settings that this kind of agent implies.
+
+        Raises:
+            ValueError: One of them is overridden by another value.
+        """
+        for name, value in self.implied.items():
+            if overrides.get(name, value) != value:
+                raise ValueError(f"{name} is {value!r} in every {type(self).__name__}; leave it out.")
+        return self.implied
 
     def _setup_model(self) -> None:
-        super()._setup_model()
-        self.planner = self.hyperparameters.make_planner()
-        self._live = self._served = None
-        self._known_adapter: tuple[tuple[Any, ...], Adapter] | None = None
+        self.policy.world = self._live = None
+        self.num_iterations = 0
+        self._served: object = None
         self._warned_of_divergence = False
-        if self.hyperparameters.adaptation(seen=1).steps:
+        self.generator.seed()
+        self.set_random_seed(self.seed)
+        if self.config.adaptation.gradient is not None:
             prepare_torch()
 
-    @abstractmethod
-    def _new_adapter(self, model: Dynamics) -> Adapter:
-        """Makes what adapts a meta-learned model."""
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Seeds the environment, the meta-learning and the planner; None changes nothing."""
+        if seed is None:
+            return
+        super().set_random_seed(seed)
+        self.seed = self.policy.seed = seed
+        self.generator.manual_seed(seed)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Gives the agent another environment with the same spaces and any number of robots.
+
+        Raises:
+            ValueError: The spaces differ, or the environment normalises observations.
+        """
+        wrapped = self._wrap_env(env, self.verbose)
+        check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
+        self._env_spec = _description(wrapped)
+        self._take_reward(wrapped)
+        self.n_envs = wrapped.num_envs
+        super().set_env(wrapped, force_reset)
+
+    def _take_reward(self, env: VecEnv) -> None:
+        """Looks for what to maximise in an environment, unless the user has said it."""
+        if self.policy.user_reward_fn is None:
+            self.policy.env_reward_fn = planning_reward(env, self.config.planning_reward)
+
+    def _require_env(self) -> VecEnv:
+        if self.env is None:
+            raise ValueError(
+                f"The agent has no environment; call set_env(env) or {type(self).__name__}.load(path, env)."
+            )
+        return self.env
+
+    def draw_seed(self) -> int:
+        """Draws a seed from the agent's generator."""
+        return int(torch.randint(2**31, (), generator=self.generator, device=self.device))
+
+    # --- what it has learnt -----------------------------------------------------------------------------
+
+    @property
+    def model(self) -> Dynamics:
+        """The meta-learned model.
+
+        Raises:
+            NotLearnedError: The agent has no model yet.
+        """
+        return self.policy.model
+
+    @property
+    def dynamics(self) -> Dynamics | None:
+        """The meta-learned model; None before :meth:`meta_learn`, where none is shipped."""
+        return None if self.policy.world is None else self.policy.world.dynamics
+
+    @property
+    def situations(self) -> tuple[str, ...]:
+        """What the training situations are called, in the order of the model's embeddings."""
+        return () if self.policy.world is None else self.policy.world.situations
+
+    @property
+    def config(self) -> Config:
+        """The settings."""
+        return self.policy.config
+
+    @config.setter
+    def config(self, config: Config) -> None:
+        self.policy.config = config
+
+    @property
+    def hyperparameters(self) -> SimpleNamespace:
+        """Deprecated: the settings by their keywords."""
+        warnings.warn("hyperparameters is called config, whose to_dict() has the keywords.", DeprecationWarning, 2)
+        return SimpleNamespace(**self.config.to_dict())
+
+    @property
+    def dims(self) -> Mapping[str, tuple[int, ...]]:
+        """The special dimensions of an observation: ``angle_dims``, ``quaternion_dims`` and ``pose_dims``."""
+        return {} if self.policy.robot is None else self.policy.robot.dims
 
     @property
     def adapter(self) -> Adapter:
-        """What adapts the agent's model.
-
-        Raises:
-            NotLearnedError: The agent has no model yet.
-        """
-        model = self.model
-        # A tensor counts how often it was written to: learning, loading and set_parameters change a model in place.
-        version = model.embeddings._version  # noqa: SLF001 - the tensor's own count has no public name
-        known = model, version, self.hyperparameters, self.seed
-        if self._known_adapter is None or self._known_adapter[0] != known:
-            self._known_adapter = known, self._new_adapter(model)
-        return self._known_adapter[1]
+        """What adapts the model; see :class:`~famle_agent.agents.policy.AdaptivePolicy`, here and below."""
+        return self.policy.adapter
 
     @property
     def controller(self) -> Controller:
-        """Algorithm 2 with the agent's adapter, planner and reward.
+        """Algorithm 2 with the agent's adapter, planner and reward."""
+        return self.policy.controller
+
+    # --- learning in simulation -------------------------------------------------------------------------
+
+    def meta_learn(
+        self,
+        envs: Sequence[EnvLike] | Transitions | None = None,
+        callback: MaybeCallback = None,
+        tb_log_name: str | None = None,
+        progress_bar: bool = False,
+        n_jobs: int = 1,
+        folder: str | os.PathLike[str] | None = None,
+    ) -> Self:
+        """Learns in simulation: collects transitions in every situation, then learns the model from them.
+
+        With ``rounds`` in the settings it goes round: the agent plans with its model in every simulated situation, and
+        learns on from all transitions. Callbacks are called once an iteration, which ``num_iterations`` counts;
+        ``num_timesteps`` counts steps of the robot and stands still.
+
+        Args:
+            envs: One environment, factory or :class:`~famle_envs.Situation` per situation; None takes the training
+                situations that the agent's environment names. Or :class:`Transitions` that were collected before, which
+                are then all that is learnt from.
+                List the situation first that the robot is in until it shows otherwise.
+            callback: Stable-Baselines3 callbacks, or a function.
+            tb_log_name: Name of the run in TensorBoard; by default the class and ``_meta``.
+            progress_bar: Whether to show progress bars.
+            n_jobs: Processes that simulate, -1 for one a core. The result does not depend on it.
+            folder: Where transitions are stored as they come, the model after each round, and once a minute how far
+                a round has got. The same call goes on where one that was stopped had got to.
+
+        Returns:
+            The agent.
 
         Raises:
-            NotLearnedError: The agent has no model yet.
-            ValueError: The agent has no reward.
+            ValueError: There are no situations, an environment's spaces differ from the agent's, or the folder is of a
+                run with other settings.
         """
-        settings = self.hyperparameters
-        how = settings.adapt_every, settings.adapt_at_reset, settings.forget_at_reset
-        return Controller(self.adapter, self.planner, self.unit_reward_fn(), *how)
+        source = envs if isinstance(envs, Transitions) else self.situation_envs(envs)
+        run = RunFolder(folder, {} if folder is None else self._fingerprint(source))  # which reads all transitions
+        if not self._custom_logger:
+            name = tb_log_name or f"{type(self).__name__}_meta"
+            self._logger = configure_logger(self.verbose, self.tensorboard_log, name)
+        hooks = self._init_callback(callback)
+        # The name that callbacks look for.
+        total_timesteps = self.config.iterations(0 if isinstance(source, Transitions) else self.config.last_round)
+        known, self.num_iterations = self.policy.world, 0
+        self.forget()
+        if folder is not None and self.seed is not None:
+            self.generator.manual_seed(self.seed)  # the same call draws the same numbers, be it the first or not
+        hooks.on_training_start(locals(), globals())
+        try:
+            with closing(meta_train(self, source, run, n_jobs, progress_bar)) as training:
+                for metrics in training:
+                    for key, value in metrics.items():
+                        self.logger.record(key, value)
+                    if self.num_iterations % max(1, total_timesteps // 200) == 0:
+                        self.logger.dump(self.num_iterations)
+                    hooks.update_locals(locals())
+                    if not hooks.on_step():
+                        break
+            if (model := self.model).n_situations > 1:
+                log_embeddings(self.logger, model.embeddings[0], self.situations, self.num_iterations)
+        except BaseException:
+            self.policy.world = known  # a half-learnt model is none
+            raise
+        hooks.on_training_end()
+        return self
+
+    def collect(
+        self, envs: Sequence[EnvLike] | None = None, progress_bar: bool = False, n_jobs: int = 1
+    ) -> Transitions:
+        """Collects the random transitions that :meth:`meta_learn` learns from; arguments as there."""
+        source = self.situation_envs(envs)
+        n = self.config.simulation.transitions_per_situation * len(source.sources)
+        with tqdm(total=n, desc="Simulating", unit="step", mininterval=1.0, disable=not progress_bar) as bar:
+            return simulate(self, source, 0, n_jobs, None, bar.update)
+
+    def situation_envs(self, envs: Sequence[EnvLike] | None = None) -> SituationEnvs:
+        """Makes or takes one environment per training situation; arguments and errors as of :meth:`meta_learn`."""
+        return situation_envs(self._require_env(), envs, self.config.simulation.episode_length)
+
+    def planning_policy(self) -> MakePolicy:
+        """Makes a policy that plans with what the agent has meta-learned, and knows which situation it is in."""
+        return planning_policy(self.policy)
+
+    def _fingerprint(self, source: SituationEnvs | Transitions) -> dict[str, Any]:
+        """What two runs must have in common for one to go on where the other stopped."""
+        return {
+            "agent": type(self).__name__,
+            "env": self._env_spec,
+            "dimensions": {name: list(dims) for name, dims in self.dims.items()},
+            "needs_reward_fn": self.policy.user_reward_fn is not None,
+            "seed": self.seed,
+            "situations": list(source.situations),
+            "transitions": source.digest() if isinstance(source, Transitions) else None,
+            "hyperparameters": self.config.to_dict(),
+        }
+
+    # --- living on a robot ------------------------------------------------------------------------------
 
     def learn(
         self,
@@ -113,7 +389,7 @@ class ModelBasedAgent(SimulationLearner):
             progress_bar: Whether to show a progress bar.
         """
         env = self._require_env()
-        if self.dynamics is None:
+        if self.policy.world is None:
             self.meta_learn(progress_bar=progress_bar)
         total_timesteps, hooks = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
@@ -124,10 +400,10 @@ class ModelBasedAgent(SimulationLearner):
         nobody = torch.zeros_like(starts)
         while self.num_timesteps < total_timesteps:
             hooks.on_rollout_start()
-            action, state = controller.act(state, self._tensor(self._last_obs), starts, self.generator)
-            new_obs, rewards, dones, infos = env.step(self._to_env(action))
+            action, state = controller.act(state, self.policy.builder.tensor(self._last_obs), starts, self.generator)
+            new_obs, rewards, dones, infos = env.step(to_action_space(action, self.action_space))
             self.num_timesteps += env.num_envs
-            reached = self._tensor(_before_reset(new_obs, dones, infos))
+            reached = self.policy.builder.tensor(_before_reset(new_obs, dones, infos))
             state = self._live = self._observed(controller.observe(state, reached, nobody))
             self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
             starts = torch.as_tensor(dones, device=self.device)
@@ -187,7 +463,7 @@ class ModelBasedAgent(SimulationLearner):
         """
         controller = self.controller
         numbers = check_observation(observation, self.observation_space)
-        obs = self._tensor(np.atleast_2d(numbers))
+        obs = self.policy.builder.tensor(np.atleast_2d(numbers))
         starts = torch.zeros(len(obs), dtype=torch.bool, device=self.device)
         if episode_start is not None:
             starts = torch.tensor(np.atleast_1d(episode_start), dtype=torch.bool, device=self.device)
@@ -206,7 +482,7 @@ class ModelBasedAgent(SimulationLearner):
         else:
             action, state = controller.act(controller.observe(state, obs, starts), obs, starts, generator)
         self._observed(state)
-        actions = self._to_env(action)
+        actions = to_action_space(action, self.action_space)
         return (actions[0] if numbers.ndim == 1 else actions), state
 
     def observe(self, obs: Array, action: Array, next_obs: Array) -> None:
@@ -222,11 +498,11 @@ class ModelBasedAgent(SimulationLearner):
             ValueError: A shape is wrong, or a value is not finite.
         """
         controller, space = self.controller, self.observation_space
-        s, s_next = (self._tensor(np.atleast_2d(check_observation(o, space))) for o in (obs, next_obs))
-        a = self._tensor(np.atleast_2d(check_action(action, self.action_space)))
+        s, s_next = (self.policy.builder.tensor(np.atleast_2d(check_observation(o, space))) for o in (obs, next_obs))
+        a = self.policy.builder.tensor(np.atleast_2d(check_action(action, self.action_space)))
         if not len(s) == len(a) == len(s_next):
             raise ValueError(f"Got {len(s)} observations, {len(a)} actions and {len(s_next)} next observations.")
-        state = replace(self.state_of(len(s)), last=(s, self._action_scale().to_unit(a).clamp(-1.0, 1.0)))
+        state = replace(self.state_of(len(s)), last=(s, self.policy.builder.action_scale.to_unit(a).clamp(-1.0, 1.0)))
         moved = torch.zeros(len(s), dtype=torch.bool, device=self.device)
         self._live = self._observed(controller.observe(state, s_next, moved))
 
@@ -259,13 +535,17 @@ class ModelBasedAgent(SimulationLearner):
         """What the agent believes of its robots now; of one robot where it has seen none."""
         return (self._live or self.state_of(self.model.robots)).belief
 
-    @abstractmethod
     def posterior(self, state: OnlineState | None = None) -> dict[str, float]:
-        """P(situation | memory) by name, of the first robot; of what the agent believes now, or of a state."""
+        """P(situation | memory) by name, of the first robot; of what the agent believes now, or of a state.
 
-    @abstractmethod
+        Where faults are composed, ``"a + b"`` is the situation with both. An agent without embeddings has one model
+        for ``"every situation"``.
+        """
+        return self.adapter.posterior(self.belief if state is None else state.belief, self.situations)
+
     def marginals(self, state: OnlineState | None = None) -> dict[str, float]:
-        """How likely each training situation is, alone or as a part of what is wrong; arguments as there."""
+        """As :meth:`posterior`, but of each training situation, be it alone or a part of what is wrong."""
+        return self.adapter.marginals(self.belief if state is None else state.belief, self.situations)
 
     def _observed(self, state: OnlineState) -> OnlineState:
         """Passes a state on, and warns of the first adaptation that diverged."""
@@ -291,10 +571,7 @@ class ModelBasedAgent(SimulationLearner):
         """
         if self._live is not None and self._live.robots == robots:
             return replace(self._live, last=None)
-        model = self.model
-        M, W = self.hyperparameters.memory_size, self.hyperparameters.selection_window
-        C = self.adapter.initial(robots).log_posterior.shape[1]
-        return self.controller.init(Memory.empty(robots, M, model.obs_dim, model.action_dim, C, self.device, W))
+        return self.policy.initial(robots)
 
     # --- saving and loading -----------------------------------------------------------------------------
 
@@ -309,29 +586,28 @@ class ModelBasedAgent(SimulationLearner):
         """
         if not hasattr(self, "observation_space"):
             raise ValueError("This agent has no environment, so that there is nothing to save; make it with one.")
-        live = self._live
-        parts: dict[str, dict[str, Tensor]] = {
-            "dynamics": {} if self.dynamics is None else self.dynamics.state_dict(),
-            "reward": {} if self.learned_reward is None else self.learned_reward.state_dict(),
-            "live": {} if live is None else live.to_tensors(),
-            # The state of another device's generator means nothing elsewhere.
-            "generator": {"state": self.generator.get_state()} if self.device.type == "cpu" else {},
-        }
+        live, world = self._live, self.policy.world
         Checkpoint(
             kind=type(self).__name__,
             mode=self.mode,
-            hyperparameters=self.hyperparameters,
+            config=self.config,
             observation_space=self.observation_space,
             action_space=self.action_space,
-            dims=self.dims,
+            dims=dict(self.dims),
             situations=self.situations,
             env=self._env_spec,
-            needs_reward_fn=self._reward_fn is not None,
+            needs_reward_fn=self.policy.user_reward_fn is not None,
             seed=self.seed,
             num_timesteps=self.num_timesteps,
             episodes=self._episode_num,
             live=None if live is None else live.counts,
-            tensors={f"{part}/{name}": value for part, values in parts.items() for name, value in values.items()},
+            tensors=joined(
+                dynamics={} if world is None else world.dynamics.state_dict(),
+                reward={} if world is None or world.reward is None else world.reward.state_dict(),
+                live={} if live is None else live.to_tensors(),
+                # The state of another device's generator means nothing elsewhere.
+                generator={"state": self.generator.get_state()} if self.device.type == "cpu" else {},
+            ),
         ).write(path)
 
     @classmethod
@@ -362,24 +638,16 @@ class ModelBasedAgent(SimulationLearner):
                 "A stored agent has all its settings, and no other mode; give load() the settings to change."
             )
         stored = Checkpoint.read(path)
-        if stored.kind != cls.__name__:
-            raise ValueError(
-                f"The file is no FAMLE checkpoint of {cls.__name__} but of {stored.kind}; load it with "
-                f"{stored.kind}.load()."
-            )
-        if stored.needs_reward_fn and reward_fn is None:
-            raise ValueError(
-                "The agent was made with a reward_fn, which no file can hold: give load(..., reward_fn=...)."
-            )
+        stored.check_agent(cls.__name__, reward_fn is not None)
         if (made := stored.make_env() if env is None else make_env(env)) is not None:
             stored.check_spaces(made)
         # All settings are in the file, so that its mode need not be known for this environment.
-        settings = {**stored.hyperparameters.to_dict(), **stored.dims, **overrides}
+        settings = {"config": stored.config, **stored.dims, **overrides}
         agent = cls(made, reward_fn=reward_fn, device=device, pretrained=False, **settings)
         agent.mode, agent.num_timesteps, agent._episode_num = stored.mode, stored.num_timesteps, stored.episodes
         if made is None:
-            agent.observation_space, agent.action_space = stored.observation_space, stored.action_space
-            agent.n_envs = 1
+            agent.observation_space, agent.action_space, agent.n_envs = stored.observation_space, stored.action_space, 1
+            agent.policy.robot = Interface(stored.observation_space, stored.action_space, stored.dims)
         agent.set_random_seed(stored.seed)
         agent._take_over(stored)
         agent.set_random_seed(overrides.get("seed"))
@@ -411,51 +679,27 @@ class ModelBasedAgent(SimulationLearner):
         if self._world(stored.env) != self._world(self._env_spec):
             differing.append("environment")
         differing += [name for name, dims in self.dims.items() if stored.dims[name] != dims]
-        differing += stored.hyperparameters.learnt_otherwise(self.hyperparameters)
+        differing += stored.config.learnt_otherwise(self.config)
         if not differing:
             self._take_over(stored.model_alone())
         return differing
 
     def _take_over(self, stored: Checkpoint) -> None:
-        known = self.situations, self.dynamics, self.learned_reward, self._live
+        policy = self.policy
+        known = policy.world, self._live
         try:
-            self.situations = stored.situations
-            self._take_weights(stored)
+            if weights := stored.part("dynamics"):
+                policy.world = policy.builder.load(weights, stored.part("reward"), stored.situations)
             if stored.live is not None:
-                self._live = self._online_state(stored, stored.live)
+                self._live = policy.stored_state(stored.part("live"), stored.live)
             if self.device.type == "cpu" and (generator := stored.part("generator")):
                 self.generator.set_state(generator["state"])
         except (KeyError, RuntimeError, TypeError) as error:
-            self.situations, self.dynamics, self.learned_reward, self._live = known  # nothing is half-taken
+            policy.world, self._live = known  # nothing is half-taken
             raise ValueError(
                 "The file's weights do not fit its settings; it is damaged, or an override changed the network: "
                 f"{error}"
             ) from error
-
-    def _take_weights(self, stored: Checkpoint) -> None:
-        if weights := stored.part("dynamics"):
-            robots = max(1, len(weights["embeddings"]) // self.hyperparameters.members)
-            self.dynamics = self.new_dynamics(robots)
-            self.dynamics.load_state_dict(weights)
-        if weights := stored.part("reward"):
-            self.learned_reward = self._new_reward()
-            self.learned_reward.load_state_dict(weights)
-
-    def _online_state(self, stored: Checkpoint, counts: dict[str, int]) -> OnlineState | None:
-        settings = self.hyperparameters
-        tensors = {name: value.to(self.device) for name, value in stored.part("live").items()}
-        state = OnlineState.from_tensors(tensors, **counts)
-        state = state.resized(settings.memory_size, settings.selection_window, settings.horizon)
-        # With other candidates than the stored agent's, what it has seen cannot be judged by what it knew of them.
-        begins = self.adapter.initial(state.robots)
-        if state.belief.log_posterior.shape == begins.log_posterior.shape:
-            return state
-        warnings.warn(
-            "What the stored agent believed of its robot is left behind: it told other situations apart than these "
-            "settings do (compose). The agent begins with what it meta-learned.",
-            stacklevel=4,
-        )
-        return None
 
     def _world(self, env: dict[str, Any] | None) -> dict[str, Any] | None:
         """What of an environment's description matters to a model of all its situations."""
@@ -464,32 +708,22 @@ class ModelBasedAgent(SimulationLearner):
         other = env_attribute(self.env, "task_arguments", ())
         return {"id": env["id"], "kwargs": {key: value for key, value in env["kwargs"].items() if key not in other}}
 
-    def _load_pretrained(self, file: Traversable) -> None:
-        with as_file(file) as path:
-            self._not_taken = self.take_model(path)
-
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ([] if self.dynamics is None else ["dynamics"]), []
-
-    def unit_reward_fn(self) -> RewardFn:
-        """Returns the reward r(s, a, s') of actions in [-1, 1], the user's, the environment's or the learnt one.
-
-        Raises:
-            ValueError: The agent has no reward.
-        """
-        known, scale = self._known_reward_fn(), self._action_scale()
-        if known is not None:
-            return lambda obs, action, next_obs: known(obs, scale.from_unit(action), next_obs)
-        if self.learned_reward is None:
-            raise ValueError("The agent has no reward; give load() the environment (env=...) or a reward_fn.")
-        return self.learned_reward
-
-    def _to_env(self, action: Tensor) -> Array:
-        """From [-1, 1] to the action space."""
-        return to_action_space(action, self.action_space)
+        return ([] if self.policy.world is None else ["dynamics"]), []
 
 
 def _before_reset(obs: Any, dones: Array, infos: Sequence[Mapping[str, Any]]) -> Array:
     """Where robots have got to; of one whose episode has ended, ``obs`` is already the next one's start."""
     ended = [info["terminal_observation"] if done else own for own, done, info in zip(obs, dones, infos, strict=True)]
     return np.stack(ended)
+
+
+def _description(env: VecEnv) -> dict[str, Any] | None:
+    """What an environment is called, and its arguments.
+
+    Raises:
+        ValueError: It normalises observations.
+    """
+    if unwrap_vec_normalize(env) is not None:
+        raise ValueError("The model normalises by itself; give the environment without VecNormalize.")
+    return env_spec(env)

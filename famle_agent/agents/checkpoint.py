@@ -19,12 +19,12 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from famle_agent.agents.config import Hyperparameters
+from famle_agent.agents.config import Config
 from famle_agent.agents.presets import known_robots
 from famle_agent.models.observation import DIMS
 from famle_agent.utils.atomic_write import whole_file
 
-__all__ = ["Checkpoint", "File", "read_checkpoint", "write_checkpoint"]
+__all__ = ["Checkpoint", "File", "joined", "read_checkpoint", "write_checkpoint"]
 
 _FORMAT = "famle-agent"
 _VERSION = 2
@@ -92,7 +92,7 @@ class Checkpoint:
     Attributes:
         kind: The name of its class.
         mode: Its mode.
-        hyperparameters: All its settings.
+        config: All its settings.
         observation_space: Of its robot.
         action_space: Of its robot.
         dims: The special dimensions of an observation by name.
@@ -108,7 +108,7 @@ class Checkpoint:
 
     kind: str
     mode: str
-    hyperparameters: Hyperparameters
+    config: Config
     observation_space: spaces.Box
     action_space: spaces.Box
     dims: dict[str, tuple[int, ...]]
@@ -126,7 +126,7 @@ class Checkpoint:
         meta = {
             "class": self.kind,
             "mode": self.mode,
-            "hyperparameters": self.hyperparameters.to_dict(),
+            "hyperparameters": self.config.to_dict(),
             "observation_space": box_to_json(self.observation_space),
             "action_space": box_to_json(self.action_space),
             **{name: list(dims) for name, dims in self.dims.items()},
@@ -155,7 +155,7 @@ class Checkpoint:
             return cls(
                 kind=str(meta["class"]),
                 mode=meta["mode"],
-                hyperparameters=Hyperparameters.from_dict(meta["hyperparameters"]),
+                config=Config.of(meta["hyperparameters"]),
                 observation_space=box_from_json(meta["observation_space"]),
                 action_space=box_from_json(meta["action_space"]),
                 dims={name: tuple(meta.get(name, ())) for name in DIMS},
@@ -183,6 +183,21 @@ class Checkpoint:
         """Returns the same with the weights only: no online state, and no random numbers."""
         weights = {name: value for name, value in self.tensors.items() if name.startswith(("dynamics/", "reward/"))}
         return replace(self, live=None, tensors=weights)
+
+    def check_agent(self, kind: str, has_reward_fn: bool) -> None:
+        """Refuses an agent that cannot be what the file describes.
+
+        Raises:
+            ValueError: It is of another kind, or has no ``reward_fn`` where the stored one was made with one.
+        """
+        if self.kind != kind:
+            raise ValueError(
+                f"The file is no FAMLE checkpoint of {kind} but of {self.kind}; load it with {self.kind}.load()."
+            )
+        if self.needs_reward_fn and not has_reward_fn:
+            raise ValueError(
+                "The agent was made with a reward_fn, which no file can hold: give load(..., reward_fn=...)."
+            )
 
     def check_spaces(self, env: Any) -> None:
         """Refuses an environment with other spaces than the agent's.
@@ -212,6 +227,11 @@ class Checkpoint:
             return gym.make(name, max_episode_steps=limit, **kwargs)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"The file's environment cannot be made ({error!r}); give load(..., env=...).") from error
+
+
+def joined(**parts: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors of all parts of an agent as "part/name", the inverse of :meth:`Checkpoint.part`."""
+    return {f"{part}/{name}": value for part, values in parts.items() for name, value in values.items()}
 
 
 def box_to_json(space: spaces.Box) -> dict[str, Any]:

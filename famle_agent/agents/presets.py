@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -11,7 +12,9 @@ import gymnasium as gym
 import yaml
 from stable_baselines3.common.vec_env import VecEnv
 
-from famle_agent.agents.config import Hyperparameters
+from famle_agent.agents.config import Config
+
+_NOTHING: Mapping[str, Any] = {}
 
 if TYPE_CHECKING:
     from importlib.resources.abc import Traversable
@@ -42,33 +45,39 @@ class Robot:
         file = files("famle_agent").joinpath("pretrained", f"{self.name}.zip")
         return file if file.is_file() else None
 
-    def hyperparameters(self, mode: str, rival: str = "", **overrides: Any) -> Hyperparameters:
+    def config(self, mode: str, rival: str = "", implied: Mapping[str, Any] = _NOTHING, **overrides: Any) -> Config:
         """The settings of a mode with some changed.
 
         Args:
             mode: The mode.
             rival: The method, where it is not FAMLE.
+            implied: Settings that the kind of agent implies.
             **overrides: Settings to change.
 
         Raises:
             TypeError: An override is no setting, or of the wrong type.
-            ValueError: The mode is unknown, or a value is out of range.
+            ValueError: The mode is unknown, or a value is out of range or has no effect.
         """
         if mode not in self.modes:
             raise ValueError(f"mode must be one of {', '.join(self.modes)}, got {mode!r}.")
         tuned = self.rivals.get(mode, {}).get(rival, {})
-        return Hyperparameters.from_dict({**self.modes[mode], **tuned, **overrides})
+        return Config.of({**self.modes[mode], **tuned, **implied, **overrides}, overrides.keys() - implied.keys())
 
 
 @cache
 def known_robots() -> dict[str, Robot]:
     """The robots that ``hyperparams/`` describes, by short name."""
+    folder = files("famle_agent").joinpath("hyperparams")
+    names = sorted(file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml"))
+    entries = {name: yaml.safe_load(folder.joinpath(f"{name}.yaml").read_text()) for name in names}
+    any_robot = entries["default"]
     robots = {}
-    for file in sorted(files("famle_agent").joinpath("hyperparams").iterdir(), key=lambda file: file.name):
-        if file.name.endswith(".yaml"):
-            entry = yaml.safe_load(file.read_text())
-            name = file.name.removesuffix(".yaml")
-            robots[name] = Robot(name, entry.pop("env_id"), rivals=entry.pop("rivals", {}), modes=entry)
+    for name, entry in entries.items():
+        # A file says only what differs: of the paper's settings for any robot, and of the paper's for this one.
+        modes = {"ours": any_robot["ours"] | entry["ours"], "paper": any_robot["paper"] | entry["paper"]}
+        if "original" in entry:
+            modes["original"] = modes["paper"] | entry["original"]
+        robots[name] = Robot(name, entry["env_id"], modes, entry["rivals"])
     return robots
 
 

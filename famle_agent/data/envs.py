@@ -282,3 +282,32 @@ def _get(env: gym.Env[Any, Any], name: str, default: Any) -> Any:
 def env_attribute(env: VecEnv, name: str, default: Any) -> Any:
     """An attribute of the first environment."""
     return env.get_attr(name)[0] if env.has_attr(name) else default
+
+
+def special_dims(
+    env: VecEnv, given: Mapping[str, Sequence[int] | None], egocentric: bool, raw_angles: bool
+) -> dict[str, tuple[int, ...]]:
+    """The special dimensions of an observation by name: those that were given, else the environment's.
+
+    Args:
+        env: The environment.
+        given: What the user says of ``angle_dims``, ``quaternion_dims`` and ``pose_dims``; None asks the environment.
+        egocentric: Whether a pose on a floor counts as one.
+        raw_angles: Whether the environment's angles count as plain numbers.
+
+    Raises:
+        ValueError: A wrapper changes the observations that the environment speaks of.
+    """
+    known = {name: tuple(env_attribute(env, name, ())) for name in given}
+    if not egocentric:
+        heading = known["pose_dims"][2:]
+        known |= {"pose_dims": (), "angle_dims": known["angle_dims"] + (heading if len(heading) == 1 else ())}
+    if raw_angles:
+        known |= {"angle_dims": ()}
+    inherited = [name for name, chosen in given.items() if chosen is None and known[name]]
+    if inherited and (changed := changing_wrappers(env, NEW_OBSERVATIONS)):
+        raise ValueError(
+            f"The environment's {', '.join(inherited)} are of what {', '.join(changed)} changes; give those of the "
+            f"wrapped observations ({inherited[0]}=..., or () for none), or the environment without that wrapper."
+        )
+    return {name: known[name] if chosen is None else tuple(chosen) for name, chosen in given.items()}

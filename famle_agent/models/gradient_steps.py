@@ -56,9 +56,9 @@ class InnerLoop:
             Inductive Bias for Transfer Learning with Convolutional Networks").
     """
 
-    steps: int
-    lr: float
-    embedding_lr: float
+    steps: int = 20
+    lr: float = 1e-3
+    embedding_lr: float = 1e-2
     optimizer: Literal["sgd", "adam"] = "sgd"
     decay: float = 0.0
 

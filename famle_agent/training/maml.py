@@ -35,11 +35,11 @@ class MAML:
         max_grad_norm: The outer gradient of each member of the ensemble is shortened to this length.
     """
 
-    iterations: int
-    meta_lr: float
-    meta_batch_size: int
-    batch_size: int
-    query_size: int
+    iterations: int = 400
+    meta_lr: float = 1.0
+    meta_batch_size: int = 20
+    batch_size: int = 64
+    query_size: int = 64
     first_order: bool = False
     max_grad_norm: float = 1.0
 

@@ -30,9 +30,9 @@ class JointTraining:
     """
 
     iterations: int
-    lr: float
-    embedding_lr: float
-    batch_size: int
+    lr: float = 1e-3
+    embedding_lr: float = 5e-3
+    batch_size: int = 512
 
     @torch.enable_grad()
     def steps(

@@ -45,11 +45,11 @@ class Reptile:
         batch_size: Transitions per inner step.
     """
 
-    iterations: int
-    meta_lr: float
-    embedding_meta_lr: float
-    meta_batch_size: int
-    batch_size: int
+    iterations: int = 400
+    meta_lr: float = 1.0
+    embedding_meta_lr: float = 1.0
+    meta_batch_size: int = 20
+    batch_size: int = 64
 
     @torch.no_grad()
     def steps(

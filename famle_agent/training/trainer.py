@@ -28,14 +28,26 @@ class MetaTrainer:
     """Trains a model on all situations at once, and meta-learns from there.
 
     Attributes:
-        joint: Training on all situations at once; none of it is the paper's.
+        joint: Training on all situations at once; None is the paper's.
         meta_learner: Reptile, which is Algorithm 1, or MAML; None leaves it at the joint training.
-        inner_loop: U^k.
+        inner_loop: U^k of the meta-learner; None without one.
+
+    Raises:
+        ValueError: There is a meta-learner without an inner loop.
     """
 
-    joint: JointTraining
+    joint: JointTraining | None
     meta_learner: Reptile | MAML | None
-    inner_loop: InnerLoop
+    inner_loop: InnerLoop | None
+
+    def __post_init__(self) -> None:
+        if self.meta_learner is not None and self.inner_loop is None:
+            raise ValueError("A meta-learner takes gradient steps; give it an inner_loop.")
+
+    @property
+    def iterations(self) -> int:
+        """How many iterations there are."""
+        return sum(learner.iterations for learner in (self.joint, self.meta_learner) if learner is not None)
 
     def fit(
         self,
@@ -56,9 +68,10 @@ class MetaTrainer:
             The losses of each iteration.
         """
         try:
-            for loss in self.joint.steps(model, data, generator, progress("joint")):
-                yield {"meta/joint_loss": loss}
-            if self.meta_learner is not None:
+            if self.joint is not None:
+                for loss in self.joint.steps(model, data, generator, progress("joint")):
+                    yield {"meta/joint_loss": loss}
+            if self.meta_learner is not None and self.inner_loop is not None:
                 for step in self.meta_learner.steps(model, data, self.inner_loop, generator, progress("meta")):
                     yield {"meta/loss_before": step.loss_before, "meta/loss_after": step.loss_after}
         finally:

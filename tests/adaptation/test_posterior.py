@@ -166,7 +166,8 @@ def test_power_of_the_likelihood_scales_the_evidence(load_agent: Load, transitio
 
 
 def test_agent_that_never_adapts_believes_what_it_did(load_agent: Load, transitions: Transitions) -> None:
-    agent = load_agent(adapt_every=0, hazard=0.1)
+    agent = load_agent(hazard=0.1)
+    agent.config = agent.config.changed(adapt_every=0)
     before = agent.posterior()
     tell(agent, transitions, [3], range(5))
     assert agent.posterior() == before

@@ -103,7 +103,7 @@ def after_each_adaptation(
 
 def test_steps_go_on_as_long_as_no_embedding_is_better(load: Load, data: Transitions) -> None:
     agent = load()
-    model, steps = agent.model, agent.hyperparameters.adaptation(0)
+    model, steps = agent.model, agent.config.adaptation.gradient.inner_loop(0)
     tell(agent, data, [STRANGE], range(30))
     seen = memory(agent).seen
     adaptations = 0
@@ -119,7 +119,7 @@ def test_steps_go_on_as_long_as_no_embedding_is_better(load: Load, data: Transit
 
 def test_agent_begins_anew_where_the_situation_changes(load: Load, data: Transitions) -> None:
     agent = load()
-    model, steps = agent.model, agent.hyperparameters.adaptation(0)
+    model, steps = agent.model, agent.config.adaptation.gradient.inner_loop(0)
     tell(agent, data, [STRANGE], range(30))
     assert memory(agent).seen > WINDOW
     began = 0

@@ -145,7 +145,7 @@ def test_candidates_follow_what_is_learnt(transitions: Transitions) -> None:
 
 def test_candidates_follow_the_settings(ensemble: FAMLE) -> None:
     assert len(ensemble.posterior()) == N_CANDIDATES
-    ensemble.hyperparameters = replace(ensemble.hyperparameters, compose=False)
+    ensemble.config = ensemble.config.changed(compose=False)
     assert len(ensemble.posterior()) == 11
 
 
@@ -196,7 +196,7 @@ def test_ensemble_learns_on_several_robots(load: Callable[..., FAMLE]) -> None:
 def test_ensemble_acts_as_the_saved_one(load: Callable[..., FAMLE], ensemble: FAMLE, transitions: Transitions) -> None:
     tell(ensemble, transitions, 3, 5)
     loaded = load(saved(ensemble))
-    assert loaded.hyperparameters == ensemble.hyperparameters
+    assert loaded.config == ensemble.config
     assert loaded.posterior() == ensemble.posterior()
     for name, value in ensemble.dynamics.state_dict().items():
         assert torch.equal(loaded.dynamics.state_dict()[name], value)

@@ -220,7 +220,8 @@ def test_callback_counts_the_meta_iterations_and_stops_them(transitions: Transit
     agent = FAMLE("reacher", seed=0, device="cpu", meta_iterations=4, inner_steps=1)
     agent.get_env().close()
     agent.meta_learn(transitions, callback=recorder)
-    assert recorder.calls == [1, 2, 3, 4]
+    assert recorder.n_calls == agent.num_iterations == 4
+    assert recorder.calls == [0, 0, 0, 0]  # the robot has not moved
     assert recorder.ended
     calls: list[int] = []
     agent.meta_learn(transitions, callback=lambda local, _: calls.append(1) or len(calls) < 2)
@@ -232,7 +233,7 @@ def test_meta_learning_again_forgets_the_robot(quick_agent: FAMLE, transitions: 
     for i in range(5):
         quick_agent.observe(transitions.obs[3, i], transitions.action[3, i], transitions.next_obs[3, i])
     assert quick_agent.belief.adaptations == 1
-    quick_agent.hyperparameters = replace(quick_agent.hyperparameters, meta_iterations=1)
+    quick_agent.config = quick_agent.config.changed(meta_iterations=1)
     quick_agent.meta_learn(transitions)
     assert quick_agent.belief.adaptations == 0
 
@@ -252,7 +253,7 @@ def test_every_mode_and_planner_runs(transitions: Transitions, make_env: MakeEnv
     )
     agent.meta_learn(transitions)
     agent.get_env().close()
-    assert run(agent, make_env(), steps=11).belief.adaptations == 10 // agent.hyperparameters.adapt_every
+    assert run(agent, make_env(), steps=11).belief.adaptations == 10 // agent.config.adaptation.every
 
 
 def test_transitions_of_another_robot_are_refused(transitions: Transitions) -> None:

@@ -178,7 +178,9 @@ def test_each_step_sees_a_minibatch_of_the_memory(load: Load, monkeypatch: pytes
 
 
 def test_rival_goes_on_from_episode_to_episode(data: Transitions) -> None:
-    agent = AMPC(make_robot(), "original", seed=0, **TINY | {"meta_iterations": 0})
+    agent = AMPC(
+        make_robot(), "original", seed=0, **TINY | {"meta_iterations": 0, "inner_steps": 0, "adapt_embedding_lr": 0.0}
+    )
     agent.meta_learn(data).learn(2 * EPISODE + 1)
     agent.get_env().close()
     assert agent.belief.adaptations == 2
@@ -316,7 +318,7 @@ def test_plans_for_the_square_of_the_distance(
     goal = (0.5, 0.5) if origin == "another robot" else (-1.0, 1.0)
     obs, action, next_obs = (torch.from_numpy(values[0]) for values in (data.obs, data.action, data.next_obs))
     expected = torch.exp(-(next_obs[:, 10:] - torch.tensor(goal)).square().sum(dim=-1))
-    torch.testing.assert_close(agent.unit_reward_fn()(obs, action, next_obs), expected)
+    torch.testing.assert_close(agent.policy.unit_reward_fn()(obs, action, next_obs), expected)
 
 
 def test_other_modes_plan_for_the_distance(load: Load, asked: list[str]) -> None:

@@ -18,21 +18,21 @@ from tests.helpers import run
 
 MakeEnv = Callable[..., gym.Env[Any, Any]]
 Load = Callable[..., ModelBasedAgent]
+META: dict[str, Any] = {"inner_steps": 5, "batch_size": 16, "meta_batch_size": 11}
 KINDS: dict[str, tuple[type[ModelBasedAgent], dict[str, Any]]] = {
     "ampc": (AMPC, {}),
-    "reptile": (AMPCMAML, {"meta_iterations": 60}),
-    "first-order-maml": (AMPCMAML, {"meta_learner": "first-order-maml", "meta_iterations": 80}),
-    "maml": (AMPCMAML, {"meta_learner": "maml", "meta_iterations": 80}),
+    "reptile": (AMPCMAML, {**META, "meta_iterations": 60}),
+    "first-order-maml": (
+        AMPCMAML,
+        {**META, "meta_learner": "first-order-maml", "meta_iterations": 80, "query_size": 16},
+    ),
+    "maml": (AMPCMAML, {**META, "meta_learner": "maml", "meta_iterations": 80, "query_size": 16}),
 }
 TINY: dict[str, Any] = {
     "device": "cpu",
     "transitions_per_situation": 60,
     "action_hold": 5,
     "hidden": (16,),
-    "inner_steps": 5,
-    "batch_size": 16,
-    "query_size": 16,
-    "meta_batch_size": 11,
     "adapt_every": 2,
     "adapt_steps": 3,
     "adapt_lr": 0.01,
@@ -199,7 +199,7 @@ def test_loaded_agent_acts_as_the_saved_one(load: Load, data: Transitions, kind:
     agent = load(kind, adapt_batch_size=batch_size)
     tell(agent, data, 5)
     loaded = load(kind, saved(agent))
-    assert loaded.hyperparameters == agent.hyperparameters
+    assert loaded.config == agent.config
     assert loaded.situations == agent.situations == data.situations
     for one in (agent, loaded):
         tell(one, data, 3, first=5)
@@ -248,7 +248,7 @@ def test_agent_without_a_model_is_refused(kind: str, robot: str) -> None:
     agent = KINDS[kind][0](robot, device="cpu")
     env, obs = agent.get_env(), np.zeros(agent.observation_space.shape)
     for call in (lambda: agent.predict(obs), agent.posterior, agent.marginals, lambda: agent.belief):
-        with pytest.raises(NotLearnedError, match=rf"meta_learn\(\) first, or {type(agent).__name__}.load"):
+        with pytest.raises(NotLearnedError, match=r"meta_learn\(\) first, or load"):
             call()
     env.close()
 
@@ -294,7 +294,7 @@ def encoded(agent: ModelBasedAgent, transitions: Transitions, rows: slice) -> Ba
 
 @pytest.mark.parametrize("kind", ["reptile", "first-order-maml", "maml"])
 def test_meta_learning_prepares_for_the_steps_on_the_robot(load: Load, unseen: Transitions, kind: str) -> None:
-    losses, rule = [], load(kind).hyperparameters.inner_loop()
+    losses, rule = [], load(kind).config.training.inner_loop
     for name in (kind, "ampc"):
         agent = load(name)
         model, support, query = agent.model, *(encoded(agent, unseen, half) for half in HALVES)

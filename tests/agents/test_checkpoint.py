@@ -53,7 +53,7 @@ def actions(agent: FAMLE, n: int = 3, obs: Any = None) -> list[np.ndarray[Any, A
 
 def test_fresh_agent_acts_as_the_saved_one(quick_agent: FAMLE, reload: Load) -> None:
     loaded = reload(quick_agent)
-    assert loaded.hyperparameters == quick_agent.hyperparameters
+    assert loaded.config == quick_agent.config
     assert loaded.situations == quick_agent.situations
     assert (loaded.mode, loaded.seed) == (quick_agent.mode, quick_agent.seed)
     assert loaded.observation_space == quick_agent.observation_space
@@ -87,7 +87,7 @@ def test_learned_reward_is_kept(reload: Load) -> None:
 def test_agent_that_has_learned_nothing(reload: Load) -> None:
     agent = FAMLE("reacher", "paper", seed=3, device="cpu", horizon=4)
     loaded = reload(agent)
-    assert loaded.hyperparameters == agent.hyperparameters
+    assert loaded.config == agent.config
     assert loaded.mode == "paper"
     with pytest.raises(NotLearnedError):
         loaded.posterior()
@@ -97,7 +97,7 @@ def test_agent_that_has_learned_nothing(reload: Load) -> None:
 def test_settings_and_environment_can_be_changed(agent_file: Path, make_env: MakeEnv) -> None:
     broken = make_env(situation="joint 3 dead")
     agent = FAMLE.load(agent_file, env=broken, device="cpu", adapt_every=0, candidates=5, verbose=1)
-    assert agent.hyperparameters.adapt_every == 0
+    assert agent.config.adaptation.every == 0
     assert agent.verbose == 1
     agent.learn(12)
     assert agent.belief.adaptations == 0

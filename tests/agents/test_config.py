@@ -11,26 +11,42 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from famle_agent import FAMLE, Hyperparameters
+import famle_agent
+from famle_agent import AMPC, FAMLE, Config
+from famle_agent.adaptation.adapters import Adaptation, Epochs, Filter, GradientSteps, Steps, Window
+from famle_agent.agents.config import Rounds, Simulation
 from famle_agent.agents.presets import known_robots, robot_of
+from famle_agent.agents.world_model import ModelConfig
 from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.planning import ICEM, MPPI, RandomShooting
 from famle_agent.training.maml import MAML
 from famle_agent.training.multitask import JointTraining
+from famle_agent.training.reptile import Reptile
+from famle_agent.training.trainer import MetaTrainer
 
 MODES = ("ours", "paper")
 every_robot = pytest.mark.parametrize("robot", list(known_robots()))
 every_mode = pytest.mark.parametrize("mode", MODES)
 
 
+def settings(**values: Any) -> Config:
+    """Settings of which each value that is given has an effect."""
+    return Config.of(values, values)
+
+
+def inner_loop(config: Config, seen: int = 1) -> InnerLoop:
+    """U^k on the robot."""
+    assert config.adaptation.gradient is not None
+    return config.adaptation.gradient.inner_loop(seen)
+
+
 @every_robot
 @every_mode
-def test_file_of_every_robot_builds_all_parts(robot: str, mode: str) -> None:
-    settings = known_robots()[robot].hyperparameters(mode)
-    assert settings.make_planner().horizon == settings.horizon
-    assert settings.reptile().iterations == settings.meta_iterations
-    assert settings.inner_loop().steps == settings.inner_steps
-    assert settings.adaptation(seen=1).optimizer == settings.inner_optimizer
+def test_file_of_every_robot_is_complete(robot: str, mode: str) -> None:
+    entry = known_robots()[robot]
+    config = entry.config(mode)
+    assert config == Config.of(entry.modes[mode])
+    assert Config.of(config.to_dict()) == config
 
 
 @every_robot
@@ -41,29 +57,28 @@ def test_robot_of_every_file_is_registered(robot: str) -> None:
 
 @every_robot
 @every_mode
-def test_file_names_no_setting_that_is_gone(robot: str, mode: str) -> None:
-    entry, known = known_robots()[robot], set(Hyperparameters().to_dict())
+def test_every_line_of_a_file_has_an_effect(robot: str, mode: str) -> None:
+    entry = known_robots()[robot]
     assert set(entry.modes) - {"original"} == set(MODES)
-    assert set(entry.modes[mode]) <= known
-    assert set(entry.rivals) <= set(entry.modes)
-    for rivals in entry.rivals.values():
-        assert all(set(settings) <= known for settings in rivals.values())
+    Config.of(entry.modes[mode], entry.modes[mode])
 
 
 @every_robot
 def test_paper_mode_has_the_settings_of_the_paper(robot: str) -> None:
-    paper = known_robots()[robot].hyperparameters("paper")
-    assert paper.planner == "random_shooting"
-    assert isinstance(paper.make_planner(), RandomShooting)
-    assert paper.inner_optimizer == "sgd"
-    assert paper.gate_actions is False
-    assert paper.compose is False
-    assert (paper.hazard, paper.likelihood_power) == (0, 1)
-    assert (paper.interaction_rank, paper.members, paper.degrees_of_freedom) == (0, 1, 0)
-    assert (paper.rounds, paper.joint_iterations, paper.round_iterations) == (0, 0, 0)
-    assert paper.meta_batch_size == 1
-    assert paper.action_hold == 1
-    assert paper.forget_at_reset is False
+    paper = known_robots()[robot].config("paper")
+    assert isinstance(paper.planner, RandomShooting)
+    assert paper.simulation.rounds is None
+    assert paper.simulation.action_hold == 1
+    model, adaptation = paper.model, paper.adaptation
+    assert (model.gate_actions, model.interaction_rank, model.members, model.degrees_of_freedom) == (False, 0, 1, 0)
+    assert paper.training.joint is None
+    assert isinstance(paper.training.meta_learner, Reptile)
+    assert paper.training.meta_learner.meta_batch_size == 1
+    assert paper.training.inner_loop is not None
+    assert paper.training.inner_loop.optimizer == "sgd"
+    assert (adaptation.compose, adaptation.likelihood_power, adaptation.evidence) == (False, 1, Window(0))
+    assert adaptation.forget_at_reset is False
+    assert inner_loop(paper) == paper.training.inner_loop
 
 
 def test_robot_of_an_environment() -> None:
@@ -73,78 +88,26 @@ def test_robot_of_an_environment() -> None:
         assert robot_of(unknown) is known_robots()["default"]
 
 
-@pytest.mark.parametrize(("planner", "kind"), [("icem", ICEM), ("mppi", MPPI), ("random_shooting", RandomShooting)])
-def test_planner_gets_its_settings(planner: str, kind: type) -> None:
-    made = Hyperparameters.from_dict(
-        {"planner": planner, "horizon": 7, "candidates": 9, "planner_iterations": 4, "init_std": 0.3}
-    ).make_planner()
-    assert type(made) is kind
-    assert (made.horizon, made.candidates) == (7, 9)
-    if kind is not RandomShooting:
-        assert (made.iterations, made.init_std) == (4, 0.3)
-
-
-def test_iterations_of_the_rounds_add_up() -> None:
-    settings = Hyperparameters(joint_iterations=100, round_iterations=20, meta_iterations=7)
-    assert settings.iterations(0) == 107
-    assert settings.iterations(3) == 167
-    assert settings.iterations(3, last=False) == 160
-    assert [settings.joint_training(i).iterations for i in range(3)] == [100, 20, 20]
-
-
-def test_joint_training_gets_its_settings() -> None:
-    made = Hyperparameters(joint_iterations=3, joint_lr=0.1, joint_embedding_lr=0.2, joint_batch_size=9)
-    assert made.joint_training(0) == JointTraining(3, lr=0.1, embedding_lr=0.2, batch_size=9)
-
-
-@pytest.mark.parametrize(
-    ("change", "alike"),
-    [
-        ({}, True),
-        ({"horizon": 3, "candidates": 7, "adapt_every": 1, "compose": True, "planner": "mppi"}, True),
-        ({"hazard": 0.1, "likelihood_power": 0.5}, True),
-        ({"hidden": (3,)}, False),
-        ({"members": 2}, False),
-        ({"joint_iterations": 1}, False),
-        ({"inner_steps": 1, "horizon": 3}, False),
-        ({"transitions_per_situation": 1}, False),
-        ({"keep_adapting": True, "adapt_at_reset": True, "clamp_predictions": True, "planning_reward": "r"}, True),
-        ({"adapt_epochs": 2, "adapt_batch_size": 8, "adapt_optimizer": "sgd"}, True),
-        ({"meta_learner": "maml"}, False),
-        ({"query_size": 3}, False),
-    ],
-)
-def test_settings_of_the_life_on_a_robot_do_not_matter_for_what_was_learnt(change: dict[str, Any], alike: bool) -> None:
-    expected = [] if alike else [name for name in change if name != "horizon"]
-    assert Hyperparameters().learnt_otherwise(Hyperparameters.from_dict(change)) == expected
-    assert Hyperparameters.from_dict(change).learnt_otherwise(Hyperparameters()) == expected
-
-
-def test_adaptation_inherits_what_is_not_said_otherwise() -> None:
-    settings = Hyperparameters(inner_steps=11, inner_lr=0.1, embedding_lr=0.2)
-    assert settings.adaptation(seen=100) == settings.inner_loop()
-    own = Hyperparameters(adapt_steps=0, adapt_lr=0.0, adapt_embedding_lr=0.5).adaptation(seen=100)
-    assert (own.steps, own.lr, own.embedding_lr) == (0, 0.0, 0.5)
-    assert Hyperparameters(adapt_decay=3.0).adaptation(seen=100) == replace(Hyperparameters().inner_loop(), decay=3.0)
-
-
-@given(st.integers(0, 5000), st.integers(1, 300), st.integers(1, 50))
-def test_epochs_pass_as_often_through_what_was_seen(seen: int, batch_size: int, epochs: int) -> None:
-    settings = Hyperparameters(adapt_epochs=epochs, adapt_batch_size=batch_size, adapt_steps=7)
-    assert settings.adaptation(seen).steps == epochs * math.ceil(seen / batch_size)
-    assert Hyperparameters(adapt_batch_size=batch_size, adapt_steps=7).adaptation(seen).steps == 7
-
-
-def test_epochs_of_the_whole_memory_are_refused() -> None:
-    with pytest.raises(ValueError, match="adapt_epochs needs an adapt_batch_size; adapt_steps counts steps"):
-        Hyperparameters(adapt_epochs=1)
-
-
-def test_adaptation_has_an_optimiser_of_its_own() -> None:
-    settings = Hyperparameters(inner_optimizer="sgd", adapt_optimizer="adam", adapt_lr=0.5, adapt_embedding_lr=0.25)
-    assert settings.adaptation(seen=1) == InnerLoop(settings.inner_steps, 0.5, 0.25, "adam")
-    assert (
-        settings.inner_loop().optimizer == Hyperparameters(inner_optimizer="sgd").adaptation(seen=1).optimizer == "sgd"
+def test_keywords_build_the_parts_they_name() -> None:
+    built = settings(
+        **{"transitions_per_situation": 7, "rounds": 2, "round_transitions": 8, "round_iterations": 9},
+        **{"joint_iterations": 3, "joint_lr": 0.1, "joint_embedding_lr": 0.2, "joint_batch_size": 9},
+        **{"hidden": [3, 4], "members": 2, "meta_iterations": 5, "meta_lr": 0.3, "inner_steps": 6, "inner_lr": 0.4},
+        **{"adapt_every": 1, "hazard": 0.1, "adapt_epochs": 2, "adapt_batch_size": 8, "adapt_optimizer": "sgd"},
+        **{"planner": "mppi", "horizon": 7, "candidates": 9, "planner_iterations": 4, "temperature": 0.3},
+    )
+    assert built == Config(
+        simulation=Simulation(7, rounds=Rounds(2, 8, 9)),
+        model=ModelConfig(hidden=(3, 4), members=2),
+        training=MetaTrainer(
+            JointTraining(3, lr=0.1, embedding_lr=0.2, batch_size=9),
+            Reptile(5, meta_lr=0.3),
+            InnerLoop(6, 0.4, optimizer="adam"),
+        ),
+        adaptation=Adaptation(
+            every=1, evidence=Filter(0.1), gradient=GradientSteps(Epochs(2), lr=0.4, optimizer="sgd", batch_size=8)
+        ),
+        planner=MPPI(7, 9, iterations=4, temperature=0.3),
     )
 
 
@@ -152,44 +115,171 @@ def test_adaptation_has_an_optimiser_of_its_own() -> None:
 def test_maml_gets_its_settings(first_order: bool) -> None:
     name = "first-order-maml" if first_order else "maml"
     sizes = {"meta_batch_size": 3, "batch_size": 4, "query_size": 5}
-    made = Hyperparameters(meta_learner=name, meta_iterations=7, meta_lr=0.1, **sizes).maml()
-    assert made == MAML(iterations=7, meta_lr=0.1, **sizes, first_order=first_order)
+    built = settings(meta_learner=name, meta_iterations=7, meta_lr=0.1, **sizes)
+    assert built.training.meta_learner == MAML(iterations=7, meta_lr=0.1, **sizes, first_order=first_order)
 
 
-@given(
-    st.fixed_dictionaries(
-        {},
-        optional={
-            "hidden": st.lists(st.integers(1, 300), min_size=1, max_size=4),
-            "inner_lr": st.floats(0, 1),
-            "adapt_steps": st.none() | st.integers(0, 100),
-            "adapt_lr": st.none() | st.floats(0, 1),
-            "meta_iterations": st.integers(1, 10_000),
-            "adapt_every": st.integers(0, 50),
-            "planner": st.sampled_from(["icem", "mppi", "random_shooting"]),
-            "gate_actions": st.booleans(),
-            "noise_beta": st.floats(0, 4),
-            "rounds": st.integers(0, 9),
-            "members": st.integers(1, 9),
-            "interaction_rank": st.integers(0, 9),
-            "degrees_of_freedom": st.floats(0, 30) | st.integers(0, 30),
-            "joint_iterations": st.integers(0, 9),
-            "compose": st.booleans(),
-            "meta_learner": st.sampled_from(["reptile", "first-order-maml", "maml"]),
-            "query_size": st.integers(1, 100),
-            "adapt_optimizer": st.sampled_from([None, "sgd", "adam"]),
-            "adapt_at_reset": st.booleans(),
-            "keep_adapting": st.booleans(),
-            "clamp_predictions": st.booleans(),
-            "planning_reward": st.text(max_size=5),
-        },
-    )
+def test_iterations_of_the_rounds_add_up() -> None:
+    config = settings(rounds=3, joint_iterations=100, round_iterations=20, meta_iterations=7)
+    assert config.last_round == 3
+    assert config.iterations(0) == 107
+    assert config.iterations(3) == 167
+    assert config.iterations(3, last=False) == 160
+    joint = [config.trainer(number, last=False).joint for number in range(3)]
+    assert [part.iterations for part in joint if part is not None] == [100, 20, 20]
+    assert config.trainer(3, last=True).iterations == 27
+
+
+@pytest.mark.parametrize(
+    ("change", "differing"),
+    [
+        ({}, []),
+        ({"horizon": 3, "candidates": 7, "adapt_every": 1, "compose": True, "planner": "mppi"}, []),
+        ({"hazard": 0.1, "likelihood_power": 0.5}, []),
+        ({"keep_adapting": True, "adapt_at_reset": True, "clamp_predictions": True, "planning_reward": "r"}, []),
+        ({"adapt_epochs": 2, "adapt_batch_size": 8, "adapt_optimizer": "sgd"}, []),
+        ({"hidden": (3,)}, ["hidden"]),
+        ({"members": 2}, ["members"]),
+        ({"inner_steps": 1, "horizon": 3}, ["inner_steps"]),
+        ({"transitions_per_situation": 1}, ["transitions_per_situation"]),
+        ({"joint_iterations": 1}, ["joint_iterations", "joint_lr", "joint_embedding_lr", "joint_batch_size"]),
+        ({"meta_learner": "maml"}, ["embedding_meta_lr", "query_size", "meta_learner"]),
+    ],
 )
+def test_settings_of_the_life_on_a_robot_do_not_matter_for_what_was_learnt(
+    change: dict[str, Any], differing: list[str]
+) -> None:
+    assert set(Config().learnt_otherwise(settings(**change))) == set(differing)
+    assert set(settings(**change).learnt_otherwise(Config())) == set(differing)
+
+
+def test_adaptation_inherits_what_is_not_said_otherwise() -> None:
+    config = settings(inner_steps=11, inner_lr=0.1, embedding_lr=0.2)
+    assert inner_loop(config) == config.training.inner_loop
+    own = inner_loop(settings(adapt_steps=3, adapt_lr=0.0, adapt_embedding_lr=0.5))
+    assert (own.steps, own.lr, own.embedding_lr) == (3, 0.0, 0.5)
+    assert inner_loop(settings(adapt_decay=3.0)) == replace(inner_loop(Config()), decay=3.0)
+    assert inner_loop(settings(inner_optimizer="sgd")).optimizer == "sgd"
+    assert inner_loop(settings(inner_optimizer="sgd", adapt_optimizer="adam")).optimizer == "adam"
+
+
+def test_no_steps_are_no_gradient() -> None:
+    assert settings(adapt_steps=0).adaptation.gradient is None
+    assert GradientSteps().length == Steps()
+
+
+@given(st.integers(0, 5000), st.integers(1, 300), st.integers(1, 50))
+def test_epochs_pass_as_often_through_what_was_seen(seen: int, batch_size: int, epochs: int) -> None:
+    passes = settings(adapt_epochs=epochs, adapt_batch_size=batch_size)
+    assert inner_loop(passes, seen).steps == epochs * math.ceil(seen / batch_size)
+    assert inner_loop(settings(adapt_batch_size=batch_size, adapt_steps=7), seen).steps == 7
+
+
+def test_epochs_of_the_whole_memory_are_refused() -> None:
+    with pytest.raises(ValueError, match="adapt_epochs needs an adapt_batch_size; adapt_steps counts steps"):
+        settings(adapt_epochs=1)
+
+
+VALUES = {
+    "hidden": st.lists(st.integers(1, 300), min_size=1, max_size=4),
+    "inner_lr": st.floats(0, 1),
+    "adapt_steps": st.none() | st.integers(0, 100),
+    "adapt_lr": st.none() | st.floats(0, 1),
+    "meta_iterations": st.integers(0, 10_000),
+    "adapt_every": st.integers(0, 50),
+    "planner": st.sampled_from(["icem", "mppi", "random_shooting"]),
+    "gate_actions": st.booleans(),
+    "noise_beta": st.floats(0, 4),
+    "rounds": st.integers(0, 9),
+    "members": st.integers(1, 9),
+    "interaction_rank": st.integers(0, 9),
+    "degrees_of_freedom": st.floats(0, 30) | st.integers(0, 30),
+    "compose": st.booleans(),
+    "hazard": st.floats(0, 0.9),
+    "meta_learner": st.sampled_from(["reptile", "first-order-maml", "maml"]),
+    "query_size": st.integers(1, 100),
+    "adapt_optimizer": st.sampled_from([None, "sgd", "adam"]),
+    "adapt_at_reset": st.booleans(),
+    "keep_adapting": st.booleans(),
+    "clamp_predictions": st.booleans(),
+    "planning_reward": st.text(max_size=5),
+}
+
+
+@given(st.fixed_dictionaries({"joint_iterations": st.integers(1, 9)}, optional=VALUES))
 def test_settings_survive_json(values: dict[str, Any]) -> None:
-    settings = Hyperparameters.from_dict(values)
-    assert Hyperparameters.from_dict(json.loads(json.dumps(settings.to_dict()))) == settings
-    for name, value in values.items():
-        assert getattr(settings, name) == (tuple(value) if name == "hidden" else value)
+    config = Config.of(values)
+    stored = json.loads(json.dumps(config.to_dict()))
+    assert Config.of(stored) == config
+    for name in values.keys() & stored.keys():
+        if values[name] is not None:
+            assert stored[name] == values[name]
+
+
+IDLE = [
+    ({"planner": "random_shooting", "elites": 3}, "elites needs planner='icem'"),
+    ({"temperature": 0.3}, "temperature needs planner='mppi'"),
+    ({"round_transitions": 3}, "round_transitions needs rounds"),
+    ({"joint_lr": 0.1}, "joint_lr needs joint_iterations"),
+    ({"meta_iterations": 0, "meta_lr": 0.1}, "meta_lr needs meta_iterations"),
+    ({"query_size": 3}, "query_size needs meta_iterations and a meta_learner that is MAML"),
+    ({"meta_learner": "maml", "embedding_meta_lr": 0.3}, "embedding_meta_lr needs"),
+    ({"hazard": 0.1, "selection_size": 3}, "selection_size needs .* no hazard"),
+    ({"adapt_every": 0, "memory_size": 3}, "memory_size needs adapt_every or adapt_at_reset"),
+    ({"adapt_steps": 0, "adapt_lr": 0.1}, "adapt_lr needs .* adapt_steps"),
+    ({"adapt_epochs": 1, "adapt_batch_size": 8, "adapt_steps": 3}, "adapt_steps needs .* no adapt_epochs"),
+    ({"meta_iterations": 0, "adapt_steps": 3, "inner_steps": 3}, "inner_steps needs"),
+]
+
+
+@pytest.mark.parametrize(("values", "message"), IDLE)
+def test_setting_without_an_effect_is_refused(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        settings(**values)
+    Config.of(values)  # as a file of an earlier version has it
+    Config.of({**Config().to_dict(), "elites": 0, "planner": "mppi"}, ["elites"])  # asks for nothing
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"round_transitions": 0, "rounds": 1, "joint_iterations": 1},
+        {"joint_batch_size": 0, "joint_iterations": 1},
+        {"query_size": 0, "meta_learner": "maml"},
+    ],
+)
+def test_nothing_is_not_enough_where_it_has_an_effect(values: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(values))} must be at least 1, got 0"):
+        settings(**values)
+
+
+def test_rounds_without_joint_training_are_refused() -> None:
+    """Algorithm 1 comes in the last round alone, so that the agent would plan with an untrained network until then."""
+    with pytest.raises(ValueError, match="give joint_iterations and round_iterations too, or rounds=0"):
+        settings(rounds=2)
+
+
+def test_setting_that_an_agent_implies_is_refused() -> None:
+    with pytest.raises(ValueError, match="gate_actions is False in every AMPC; leave it out"):
+        AMPC("Pendulum-v1", device="cpu", gate_actions=True)
+    assert AMPC("Pendulum-v1", device="cpu", gate_actions=False).config.model.gate_actions is False
+
+
+def test_nested_settings_are_taken_as_they_are() -> None:
+    config = Config(planner=RandomShooting(3, 7), adaptation=Adaptation(gradient=None))
+    assert FAMLE("Pendulum-v1", device="cpu", config=config).config == config
+    changed = FAMLE("Pendulum-v1", device="cpu", config=config, horizon=4).config
+    assert changed == replace(config, planner=RandomShooting(4, 7))
+    with pytest.raises(ValueError, match="horizon must be at least 1, got 0"):
+        Config(planner=RandomShooting(0, 7))
+
+
+def test_old_name_goes_on_working() -> None:
+    with pytest.warns(DeprecationWarning, match="Config"):
+        assert famle_agent.Hyperparameters(horizon=3) == Config.of({"horizon": 3})
+    agent = FAMLE("Pendulum-v1", device="cpu", horizon=3)
+    with pytest.warns(DeprecationWarning, match="config"):
+        assert agent.hyperparameters.horizon == 3
 
 
 @pytest.mark.parametrize(
@@ -225,7 +315,6 @@ def test_unknown_setting_names_the_one_that_was_meant(name: str, suggestion: str
         ("hazard", 1.0),
         ("hazard", float("nan")),
         ("likelihood_power", -0.5),
-        ("round_transitions", 0),
         ("members", 0),
         ("interaction_rank", -1),
         ("degrees_of_freedom", -0.5),
@@ -234,11 +323,9 @@ def test_unknown_setting_names_the_one_that_was_meant(name: str, suggestion: str
         ("round_iterations", -1),
         ("joint_lr", -1e-3),
         ("joint_embedding_lr", -1e-3),
-        ("joint_batch_size", 0),
         ("meta_iterations", -1),
         ("meta_learner", "mamml"),
         ("meta_learner", None),
-        ("query_size", 0),
         ("adapt_epochs", -1),
         ("adapt_batch_size", -1),
         ("adapt_optimizer", "lion"),
@@ -246,7 +333,7 @@ def test_unknown_setting_names_the_one_that_was_meant(name: str, suggestion: str
 )
 def test_value_out_of_range_is_refused(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=name):
-        Hyperparameters.from_dict({name: value})
+        settings(**{name: value})
 
 
 @pytest.mark.parametrize(
@@ -271,7 +358,7 @@ def test_value_out_of_range_is_refused(name: str, value: Any) -> None:
 )
 def test_value_of_the_wrong_type_is_refused(name: str, value: Any) -> None:
     with pytest.raises(TypeError, match=name):
-        Hyperparameters.from_dict({name: value})
+        settings(**{name: value})
 
 
 @pytest.mark.parametrize(
@@ -286,12 +373,12 @@ def test_value_of_the_wrong_type_is_refused(name: str, value: Any) -> None:
     ],
 )
 def test_numbers_of_any_kind_are_taken(name: str, value: Any) -> None:
-    assert np.array_equal(getattr(Hyperparameters.from_dict({name: value}), name), value)
+    assert settings(**{name: value}) == Config.of({} if value is None else {name: value})
 
 
 def test_validation_leaves_something_to_learn_from() -> None:
     with pytest.raises(ValueError, match="below memory_size, 50"):
-        Hyperparameters(memory_size=50, validation_size=50)
+        settings(memory_size=50, validation_size=50)
 
 
 def test_unknown_mode_names_the_known_ones() -> None:
@@ -300,7 +387,8 @@ def test_unknown_mode_names_the_known_ones() -> None:
 
 
 def test_overrides_win_over_the_file() -> None:
-    settings = known_robots()["reacher"].hyperparameters("paper", planner="mppi", inner_steps=1)
-    assert (settings.planner, settings.inner_steps) == ("mppi", 1)
-    assert settings.inner_optimizer == "sgd"
-    assert known_robots()["reacher"].hyperparameters("paper").planner == "random_shooting"
+    config = known_robots()["reacher"].config("paper", planner="mppi", inner_steps=1)
+    assert isinstance(config.planner, MPPI)
+    assert config.training.inner_loop == InnerLoop(1, 0.05, 0.5, "sgd")
+    assert isinstance(known_robots()["reacher"].config("paper").planner, RandomShooting)
+    assert isinstance(known_robots()["reacher"].config("ours").planner, ICEM)

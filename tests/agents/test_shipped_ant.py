@@ -23,7 +23,7 @@ def agent() -> Any:
 
 def test_package_ships_a_model_of_these_settings(agent: FAMLE) -> None:
     assert agent.dynamics is not None
-    assert agent.dynamics.members == agent.hyperparameters.members
+    assert agent.dynamics.members == agent.config.model.members
     assert len(agent.situations) == 20
     assert agent.situations[0] == "intact"
 

@@ -19,7 +19,7 @@ def test_package_ships_a_small_model_of_these_settings(robot: str, n_situations:
     agent = FAMLE(robot, seed=0, device="cpu")
     agent.get_env().close()
     assert agent.dynamics is not None
-    assert agent.dynamics.members == agent.hyperparameters.members
+    assert agent.dynamics.members == agent.config.model.members
     assert len(agent.situations) == n_situations
     assert agent.situations[0] == "intact"
     file = known_robots()[robot].pretrained

@@ -79,7 +79,7 @@ def test_agent_recovers_when_it_adapts(agent: FAMLE, make_env: MakeEnv) -> None:
     episode()
     adapted = episode()
     agent.forget()
-    agent.hyperparameters = type(agent.hyperparameters).from_dict({**agent.hyperparameters.to_dict(), "adapt_every": 0})
+    agent.config = agent.config.changed(adapt_every=0)
     assert adapted > episode() + 5
 
 

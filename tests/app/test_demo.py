@@ -32,7 +32,7 @@ def test_demo_of_the_arm_writes_all_it_promises(
         assert film.n_frames > 1
         assert film.size[0] > 1.5 * film.size[1]  # two films next to each other
     agent = FAMLE.load(out / "agent.zip", device="cpu")
-    assert agent.hyperparameters.meta_iterations == 2
+    assert agent.config.training.meta_learner.iterations == 2
     assert len(agent.situations) == 11
     agent.get_env().close()
     assert "meta/loss_after" in scalars(out / "tensorboard" / "FAMLE_meta_1")

@@ -53,7 +53,7 @@ def test_situations_are_numbered_where_they_have_no_name(learned: FAMLE) -> None
 def test_reward_is_learned(learned: FAMLE) -> None:
     data = pendulum(transitions_per_situation=100).collect([lambda: gym.make("Pendulum-v1")])
     obs, action, next_obs = (torch.from_numpy(getattr(data, name)) for name in ("obs", "action", "next_obs"))
-    predicted = learned.unit_reward_fn()(obs, action / 2.0, next_obs)
+    predicted = learned.policy.unit_reward_fn()(obs, action / 2.0, next_obs)
     assert predicted.shape == (1, 100)
     correlation = np.corrcoef(predicted.flatten().numpy(), data.reward.flatten())[0, 1]
     assert correlation > 0.9
@@ -119,7 +119,7 @@ def test_reward_function_of_the_user_is_used() -> None:
 
     agent = pendulum(reward_fn=spin, meta_iterations=2)
     agent.meta_learn([lambda: gym.make("Pendulum-v1")])
-    assert agent.learned_reward is None
+    assert agent.policy.world.reward is None
     action, _ = agent.predict(np.array([1.0, 0.0, 0.0], np.float32))
     assert action[0] > 1.5  # the reward is the torque, and the largest one is 2
     largest = torch.stack([value.abs().max() for value in seen]).max()
@@ -129,7 +129,7 @@ def test_reward_function_of_the_user_is_used() -> None:
 def test_reward_function_of_the_user_comes_before_the_environments(make_env: MakeEnv) -> None:
     agent = FAMLE(make_env(), reward_fn=lambda obs, action, next_obs: action[..., 2], device="cpu", seed=0)
     action, obs = torch.rand(1, 3, 5), torch.zeros(1, 3, 12)
-    torch.testing.assert_close(agent.unit_reward_fn()(obs, action, obs), action[..., 2])
+    torch.testing.assert_close(agent.policy.unit_reward_fn()(obs, action, obs), action[..., 2])
 
 
 def test_environment_reward_is_used(make_env: MakeEnv) -> None:
@@ -137,7 +137,7 @@ def test_environment_reward_is_used(make_env: MakeEnv) -> None:
     agent = FAMLE(env, device="cpu")
     obs, action, next_obs = torch.rand(2, 3, 12), torch.rand(2, 3, 5), torch.rand(2, 3, 12)
     expected = env.unwrapped.reward_fn(obs, action, next_obs)
-    torch.testing.assert_close(agent.unit_reward_fn()(obs, action, next_obs), expected)
+    torch.testing.assert_close(agent.policy.unit_reward_fn()(obs, action, next_obs), expected)
 
 
 def test_angles_are_those_of_the_environment_or_of_the_user(make_env: MakeEnv) -> None:
@@ -151,10 +151,10 @@ def test_quaternions_are_those_of_the_environment_or_of_the_user(make_env: MakeE
     assert FAMLE(ant, device="cpu", pretrained=False).dims["quaternion_dims"] == (1, 2, 3, 4)
     own = FAMLE(ant, device="cpu", pretrained=False, quaternion_dims=())
     assert own.dims["quaternion_dims"] == ()
-    assert own.new_dynamics().n_features == 27
+    assert own.policy.builder.dynamics(1).n_features == 27
     assert FAMLE(make_env(), device="cpu").dims["quaternion_dims"] == ()
     turned = FAMLE(make_env(), device="cpu", angle_dims=(0,), quaternion_dims=(4, 3, 2, 1))
-    assert turned.new_dynamics().n_features == 7 + 2 + 10
+    assert turned.policy.builder.dynamics(1).n_features == 7 + 2 + 10
 
 
 @pytest.mark.parametrize(
@@ -332,7 +332,7 @@ def test_discrete_actions_of_a_registered_environment_are_refused() -> None:
 @pytest.mark.parametrize("mode", ["paper", "original"])
 def test_wrapped_robot_has_the_settings_of_the_robot(make_env: MakeEnv, mode: str) -> None:
     wrapped = FAMLE(gym.wrappers.TimeLimit(make_env(), 20), mode, device="cpu")
-    assert wrapped.hyperparameters == FAMLE("reacher", mode, device="cpu").hyperparameters
+    assert wrapped.config == FAMLE("reacher", mode, device="cpu").config
 
 
 def test_agent_of_a_wrapped_robot_is_loaded_with_and_without_it(make_env: MakeEnv, tmp_path: Path) -> None:
@@ -340,4 +340,4 @@ def test_agent_of_a_wrapped_robot_is_loaded_with_and_without_it(make_env: MakeEn
     wrapped.save(tmp_path / "agent.zip")
     for env in (None, gym.wrappers.TimeLimit(make_env(), 20)):
         loaded = FAMLE.load(tmp_path / "agent.zip", env, device="cpu")
-        assert (loaded.mode, loaded.hyperparameters) == ("original", wrapped.hyperparameters)
+        assert (loaded.mode, loaded.config) == ("original", wrapped.config)

@@ -230,4 +230,4 @@ def test_agent_for_a_robot_with_an_own_profile_has_the_settings_of_that_robot() 
     agents = [FAMLE(gym.make("FamleQuadruped-v0", profile=p), device="cpu") for p in ("held-out", Profile("mine"))]
     for agent in agents:
         agent.get_env().close()
-    assert agents[0].hyperparameters == agents[1].hyperparameters
+    assert agents[0].config == agents[1].config

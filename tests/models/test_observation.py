@@ -227,7 +227,7 @@ def test_yaw_is_an_angle_to_the_model_of_the_paper_too() -> None:
     agent = FAMLE("FamleMinitaur-v0", "paper", device="cpu")
     agent.get_env().close()
     obs, next_obs = (torch.tensor([0.0, 0.0, 0.2, 0.0, 0.0, yaw]) for yaw in (math.pi - 0.05, -math.pi + 0.05))
-    assert agent.new_dynamics().targets(obs, next_obs)[5].item() == pytest.approx(0.1, abs=1e-5)
+    assert agent.policy.builder.dynamics(1).targets(obs, next_obs)[5].item() == pytest.approx(0.1, abs=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from famle_agent import FAMLE, Transitions
-from famle_agent.agents import simulation
+from famle_agent.agents import meta_training
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.training.progress import Progress
 
@@ -35,6 +35,8 @@ TINY: dict[str, Any] = {
     "planner_iterations": 2,
     "elites": 3,
 }
+NO_META: dict[str, Any] = {"meta_iterations": 0, "meta_batch_size": 0}
+ONE_ROUND: dict[str, Any] = {"rounds": 0, "round_transitions": 0, "round_iterations": 0}
 ITERATIONS = [6, 10, 17]
 """Iterations that are done after each round; Algorithm 1 comes after the last one."""
 
@@ -77,19 +79,33 @@ def stored(folder: Path, round_: int) -> list[Transitions]:
 def watch(agent: FAMLE, monkeypatch: pytest.MonkeyPatch) -> list[Transitions]:
     """All transitions that each round learns from."""
     seen: list[Transitions] = []
-    begin = agent.begin_model
+    begin = meta_training.begin_model
 
-    def begin_model(transitions: Transitions, new: bool) -> Any:
-        seen.append(transitions)
-        return begin(transitions, new)
+    def begin_model(policy: Any, transitions: Transitions, *args: Any) -> Any:
+        if policy is agent.policy:
+            seen.append(transitions)
+        return begin(policy, transitions, *args)
 
-    monkeypatch.setattr(agent, "begin_model", begin_model)
+    monkeypatch.setattr(meta_training, "begin_model", begin_model)
     return seen
+
+
+def models_of_rounds(monkeypatch: pytest.MonkeyPatch) -> list[Dynamics]:
+    """The model that each round learns."""
+    models, begin = list[Dynamics](), meta_training.begin_model
+
+    def begin_model(*args: Any) -> Any:
+        model, data = begin(*args)
+        models.append(model)
+        return model, data
+
+    monkeypatch.setattr(meta_training, "begin_model", begin_model)
+    return models
 
 
 def interrupt_at(iteration: int) -> Callable[..., bool]:
     def callback(local: dict[str, Any], _: Any) -> bool:
-        if local["self"].num_timesteps == iteration:
+        if local["self"].num_iterations == iteration:
             raise KeyboardInterrupt
         return True
 
@@ -102,7 +118,7 @@ def interrupt_at(iteration: int) -> Callable[..., bool]:
 def test_each_round_learns_from_more_transitions(make_agent: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     agent, steps = make_agent(), list[int]()
     seen = watch(agent, monkeypatch)
-    agent.meta_learn(SITUATIONS, callback=lambda local, _: steps.append(local["self"].num_timesteps) or True)
+    agent.meta_learn(SITUATIONS, callback=lambda local, _: steps.append(local["self"].num_iterations) or True)
     assert [transitions.obs.shape[1] for transitions in seen] == [40, 52, 64]
     for earlier, later in pairwise(seen):
         n = earlier.obs.shape[1]
@@ -122,7 +138,7 @@ def test_rounds_plan_for_the_reward(make_agent: Make, monkeypatch: pytest.Monkey
     agent.meta_learn(SITUATIONS)
     first, last = seen[-1].reward[:, :40], seen[-1].reward[:, 60:]  # once it has come to the goal
     assert last.mean() > first.mean() + 0.1
-    held = agent.hyperparameters.action_hold
+    held = agent.config.simulation.action_hold
     assert held > 1
     np.testing.assert_array_equal(seen[-1].action[:, 0], seen[-1].action[:, 1])
     changed = np.abs(np.diff(seen[-1].action[:, 40:], axis=1)).max(axis=-1) > 1e-3
@@ -130,33 +146,19 @@ def test_rounds_plan_for_the_reward(make_agent: Make, monkeypatch: pytest.Monkey
 
 
 def test_model_goes_on_from_round_to_round(make_agent: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    agent, models = make_agent(joint_lr=0.0, joint_embedding_lr=0.0, meta_iterations=0), list[Dynamics]()
-    learn = agent.begin_model
-
-    def begin_model(*args: Any) -> Any:
-        model, data = learn(*args)
-        models.append(model)
-        return model, data
-
-    monkeypatch.setattr(agent, "begin_model", begin_model)
+    agent = make_agent(joint_lr=0.0, joint_embedding_lr=0.0, **NO_META)
+    models = models_of_rounds(monkeypatch)
     agent.meta_learn(SITUATIONS)
     assert models[0] is models[1] is models[2]
-    fresh = make_agent(joint_lr=0.0, joint_embedding_lr=0.0, meta_iterations=0, rounds=0).meta_learn(SITUATIONS)
+    fresh = make_agent(joint_lr=0.0, joint_embedding_lr=0.0, **NO_META, **ONE_ROUND).meta_learn(SITUATIONS)
     assert fresh.dynamics is not None
     assert torch.equal(models[2].embeddings, fresh.dynamics.embeddings)
     assert torch.equal(models[2].input_mean, fresh.dynamics.input_mean)  # the units stay those of the first round
 
 
 def test_last_round_may_begin_anew(make_agent: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    agent = make_agent(restart_last_round=True, joint_lr=0.0, joint_embedding_lr=0.0, meta_iterations=0)
-    models, learn = list[Dynamics](), agent.begin_model
-
-    def begin_model(*args: Any) -> Any:
-        model, data = learn(*args)
-        models.append(model)
-        return model, data
-
-    monkeypatch.setattr(agent, "begin_model", begin_model)
+    agent = make_agent(restart_last_round=True, joint_lr=0.0, joint_embedding_lr=0.0, **NO_META)
+    models = models_of_rounds(monkeypatch)
     agent.meta_learn(SITUATIONS)
     assert models[0] is models[1] is not models[2]
     assert not torch.equal(models[2].embeddings, models[0].embeddings)
@@ -164,7 +166,7 @@ def test_last_round_may_begin_anew(make_agent: Make, monkeypatch: pytest.MonkeyP
 
 
 def test_meta_learning_again_begins_anew(make_agent: Make) -> None:
-    agent = make_agent(rounds=0).meta_learn(SITUATIONS)
+    agent = make_agent(**ONE_ROUND).meta_learn(SITUATIONS)
     before = agent.dynamics
     agent.meta_learn(SITUATIONS)
     assert agent.dynamics is not before
@@ -185,7 +187,7 @@ def test_callback_ends_all_rounds(make_agent: Make, last: int, tmp_path: Path) -
     agent, steps = make_agent(), list[int]()
     agent.meta_learn(
         SITUATIONS,
-        callback=lambda local, _: steps.append(1) or local["self"].num_timesteps < last,
+        callback=lambda local, _: steps.append(1) or local["self"].num_iterations < last,
         folder=tmp_path,
     )
     assert len(steps) == last
@@ -196,19 +198,19 @@ def test_callback_ends_all_rounds(make_agent: Make, last: int, tmp_path: Path) -
 
 def test_reward_that_is_learned_judges_the_plans_of_a_round() -> None:
     """The reward network knows actions in [-1, 1]; the environment's go from -2 to 2."""
-    settings = TINY | {"rounds": 0, "candidates": 40, "planner": "random_shooting"}
+    settings = TINY | ONE_ROUND | {"candidates": 40, "planner": "random_shooting", "planner_iterations": 0, "elites": 0}
     agent = FAMLE("Pendulum-v1", device="cpu", seed=0, **settings)
     agent.meta_learn([lambda g=g: gym.make("Pendulum-v1", g=g) for g in (3.0, 10.0)])
     policy = agent.planning_policy()(agent.get_env().envs[0], 0, np.random.default_rng(0))
     seen: list[torch.Tensor] = []
-    original = type(agent.learned_reward).forward
+    original = type(agent.policy.world.reward).forward
 
     def forward(self: Any, obs: torch.Tensor, action: torch.Tensor, next_obs: torch.Tensor) -> torch.Tensor:
         seen.append(action)
         return original(self, obs, action, next_obs)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(type(agent.learned_reward), "forward", forward)
+        patch.setattr(type(agent.policy.world.reward), "forward", forward)
         action = policy(np.array([1.0, 0.0, 0.0], np.float32), True)
     assert seen
     assert 0.9 < torch.cat([value.flatten() for value in seen]).abs().max() <= 1.0 + 1e-6
@@ -228,7 +230,7 @@ def test_interrupted_run_goes_on_to_the_same_agent(
     iteration: int,
     every: float,
 ) -> None:
-    monkeypatch.setattr(simulation, "Progress", partial(Progress, every=every))
+    monkeypatch.setattr(meta_training, "Progress", partial(Progress, every=every))
     with pytest.raises(KeyboardInterrupt):
         make_agent().meta_learn(SITUATIONS, callback=interrupt_at(iteration), folder=tmp_path)
     rounds = sum(iteration > done for done in ITERATIONS)
@@ -237,7 +239,7 @@ def test_interrupted_run_goes_on_to_the_same_agent(
     steps: list[int] = []
     agent = make_agent()
     agent.meta_learn(
-        SITUATIONS, callback=lambda local, _: steps.append(local["self"].num_timesteps) or True, folder=tmp_path
+        SITUATIONS, callback=lambda local, _: steps.append(local["self"].num_iterations) or True, folder=tmp_path
     )
     assert_same(agent.dynamics, uninterrupted)
     saved = iteration - 1 if every == 0.0 else {2: 0, 8: 6, 12: 10, 16: 14}[iteration]
@@ -248,14 +250,13 @@ def test_interrupted_run_goes_on_to_the_same_agent(
 
 
 def test_interrupted_simulation_goes_on_to_the_same_agent(
-    make_agent: Make, uninterrupted: Dynamics, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_agent: Make, uninterrupted: Dynamics, tmp_path: Path
 ) -> None:
     """Stopped in the first round of planning, in its second situation."""
-    agent = make_agent()
-    planning = agent.planning_policy
+    agent, planning = make_agent(), meta_training.planning_policy
 
-    def stops() -> Any:
-        make = planning()
+    def stops(policy: Any) -> Any:
+        make = planning(policy)
 
         def make_policy(env: Any, situation: int, rng: np.random.Generator) -> Any:
             if situation == 1:
@@ -264,8 +265,8 @@ def test_interrupted_simulation_goes_on_to_the_same_agent(
 
         return make_policy
 
-    monkeypatch.setattr(agent, "planning_policy", stops)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(meta_training, "planning_policy", stops)
         agent.meta_learn(SITUATIONS, folder=tmp_path)
     assert [file.name for file in (tmp_path / "round-1").iterdir()] == ["situation-000.npz"]
     assert_same(make_agent().meta_learn(SITUATIONS, folder=tmp_path).dynamics, uninterrupted)
@@ -291,7 +292,7 @@ def test_interrupted_rounds_leave_the_agent_as_it_was(make_agent: Make, iteratio
     known, weights = agent.dynamics, copy.deepcopy(agent.dynamics.state_dict())
 
     def stop(local: dict[str, Any], _: dict[str, Any]) -> bool:
-        if agent.num_timesteps == iteration:
+        if agent.num_iterations == iteration:
             raise KeyboardInterrupt
         return True
 
@@ -310,7 +311,7 @@ def test_interrupted_rounds_leave_the_agent_as_it_was(make_agent: Make, iteratio
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run of one round."""
     folder = tmp_path_factory.mktemp("run")
-    agent = FAMLE("reacher", device="cpu", seed=0, **{**TINY, "rounds": 0}).meta_learn(SITUATIONS, folder=folder)
+    agent = FAMLE("reacher", device="cpu", seed=0, **(TINY | ONE_ROUND)).meta_learn(SITUATIONS, folder=folder)
     agent.get_env().close()
     return folder
 
@@ -330,7 +331,7 @@ def test_folder_of_another_run_is_refused(
     make_agent: Make, finished: Path, overrides: dict[str, Any], situations: list[str], differing: str
 ) -> None:
     with pytest.raises(ValueError, match=rf"differs in: {differing}\."):
-        make_agent(rounds=0, **overrides).meta_learn(situations, folder=finished)
+        make_agent(**ONE_ROUND, **overrides).meta_learn(situations, folder=finished)
 
 
 @pytest.mark.parametrize("size", [0, 100])
@@ -342,7 +343,7 @@ def test_damaged_model_of_a_round_is_named(make_agent: Make, finished: Path, tmp
     damaged = tmp_path / "round-0.zip"
     damaged.write_bytes(damaged.read_bytes()[:size])
     with pytest.raises(ValueError, match=r"round-0\.zip is no FAMLE checkpoint, or it is damaged"):
-        make_agent(rounds=0).meta_learn(SITUATIONS, folder=tmp_path)
+        make_agent(**ONE_ROUND).meta_learn(SITUATIONS, folder=tmp_path)
 
 
 def test_transitions_of_another_kind_are_not_taken_for_those_of_the_folder(

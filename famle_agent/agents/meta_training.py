@@ -1,0 +1,180 @@
+"""Meta-training in rounds: simulate every situation, learn from all transitions so far, plan there, and again.
+
+One round is the paper's: random actions, then Algorithm 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from copy import deepcopy
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from famle_agent.agents.policy import AdaptivePolicy
+from famle_agent.agents.world_model import WorldModel
+from famle_agent.data.collect import collect
+from famle_agent.data.envs import SituationEnvs
+from famle_agent.data.policies import MakePolicy, make_held_uniform, make_planning, reward_names
+from famle_agent.data.transitions import Transitions
+from famle_agent.models.dynamics import Batch, Dynamics
+from famle_agent.training.progress import Progress
+from famle_agent.training.run_folder import RunFolder
+from famle_agent.training.trainer import Metrics
+
+__all__ = ["Learner", "begin_model", "meta_train", "planning_policy", "simulate"]
+
+
+class Learner(Protocol):
+    """An agent, as far as meta-training knows it.
+
+    Attributes:
+        num_iterations: Iterations of learning that it has done in this meta-training.
+        generator: Source of all the chance.
+    """
+
+    num_iterations: int
+    generator: torch.Generator
+
+    @property
+    def policy(self) -> AdaptivePolicy:
+        """Its settings, and what it has learnt so far."""
+
+    def draw_seed(self) -> int:
+        """Draws a seed from its generator."""
+
+    def save(self, path: Path) -> None:
+        """Stores it."""
+
+    def restore(self, file: Path) -> None:
+        """Goes back to where it was when it was stored."""
+
+
+def meta_train(
+    agent: Learner, source: SituationEnvs | Transitions, folder: RunFolder, n_jobs: int, progress_bar: bool
+) -> Generator[Metrics]:
+    """Runs Algorithm 1 round by round: simulates, and learns from all that has been simulated so far.
+
+    Args:
+        agent: Its ``policy.world`` becomes what was learnt, and changes as the iterator is advanced.
+        source: The situations' environments, or transitions that were collected before.
+        folder: Where it goes on from, and stores what it has done.
+        n_jobs: Processes that simulate.
+        progress_bar: Whether to show progress bars.
+
+    Yields:
+        The losses of each iteration.
+    """
+    policy, config, transitions = agent.policy, agent.policy.config, None
+    last = 0 if isinstance(source, Transitions) else config.last_round
+    bar = partial(_bar, rounds=last + 1, disable=not progress_bar)
+    for number in range(last + 1):
+        # Lines 1 to 6: transitions D_c of every situation c.
+        new = source
+        if isinstance(new, SituationEnvs):
+            with bar("Simulating", number, config.simulation.transitions(number) * len(new.sources), "step") as shown:
+                new = simulate(agent, new, number, n_jobs, folder.transitions(number), shown.update)
+        new = policy.builder.in_model_units(new)
+        transitions = new if transitions is None else transitions.followed_by(new)
+        if (stored := folder.finished(number)) is not None:
+            agent.restore(stored)
+            agent.num_iterations = config.iterations(number, number == last)
+            continue
+
+        # Lines 7 to 14: theta and H from them.
+        left = config.iterations(number, number == last) - agent.num_iterations
+        with bar("Meta-learning", number, left, "it") as shown, torch.random.fork_rng(devices=[]):
+            torch.manual_seed(agent.draw_seed())  # initial weights come from torch's global generator
+            model, data = begin_model(policy, transitions, config.begins_anew(number, number == last), agent.generator)
+            progress = partial(_progress, agent, folder, number, shown)
+            for metrics in config.trainer(number, number == last).fit(model, data, agent.generator, progress):
+                shown.set_postfix({key.split("/")[-1]: f"{value:.3g}" for key, value in metrics.items()}, refresh=False)
+                shown.update()
+                agent.num_iterations += 1
+                yield metrics
+        folder.finish(number, agent.save)
+
+
+def simulate(
+    agent: Learner, envs: SituationEnvs, number: int, n_jobs: int, folder: Path | None, callback: Callable[[int], Any]
+) -> Transitions:
+    """Collects random transitions in round 0, and the agent's own planning after that.
+
+    Args:
+        agent: Who plans.
+        envs: The situations.
+        number: The round, from 0.
+        n_jobs: Processes; the result does not depend on it.
+        folder: Where transitions are stored as they come.
+        callback: Is told how many steps have been simulated since it was last told.
+    """
+    how = agent.policy.config.simulation
+    make_policy: MakePolicy = planning_policy(agent.policy) if number else make_held_uniform(how.action_hold)
+    seed = agent.draw_seed()
+    n = how.transitions(number)
+    return collect(envs.sources, envs.situations, n, make_policy, seed, callback, n_jobs, folder, how.episode_length)
+
+
+def planning_policy(policy: AdaptivePolicy) -> MakePolicy:
+    """Makes a policy for simulation that plans with what was learnt so far, and knows which situation it is in.
+
+    Raises:
+        NotLearnedError: Nothing was learnt yet.
+    """
+    model, reward_fn = deepcopy(policy.model).cpu(), policy.user_reward_fn
+    if reward_fn is None and policy.world is not None and policy.world.reward is not None:
+        learned = deepcopy(policy.world.reward).cpu()
+        scale = replace(policy.builder, device=torch.device("cpu")).action_scale
+
+        def reward_fn(obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
+            return learned(obs, scale.to_unit(action), next_obs)  # type: ignore[no-any-return]
+
+    return make_planning(model, policy.config.planner, reward_fn, reward_names(policy.config.planning_reward))
+
+
+def begin_model(
+    policy: AdaptivePolicy, transitions: Transitions, anew: bool, generator: torch.Generator
+) -> tuple[Dynamics, Batch]:
+    """Gives a policy the model that is learnt in a round, and learns the reward where none is known.
+
+    Args:
+        policy: Its ``world`` is replaced.
+        transitions: All so far, with actions in [-1, 1].
+        anew: Whether to begin with a new model, instead of going on with the one so far.
+        generator: Source of all the chance, but for the initial weights.
+
+    Returns:
+        The model, and the transitions as it sees them.
+    """
+    builder, reward = policy.builder, None
+    obs, action, next_obs = builder.tensors(transitions)
+    if policy.known_reward_fn is None:
+        reward = builder.reward()
+        reward.fit(obs, action, next_obs, builder.tensor(transitions.reward), generator)
+    if anew:
+        model = builder.dynamics(len(transitions.situations))
+        model.fit_normalisation(obs, action, next_obs)
+    else:
+        model = policy.model
+    policy.world = WorldModel(model, transitions.situations, reward)
+    return model, model.encode(obs, action, next_obs)
+
+
+def _bar(name: str, number: int, total: int, unit: str, rounds: int, disable: bool) -> tqdm[Any]:
+    desc = f"{name} {number + 1}/{rounds}" if rounds > 1 else name
+    return tqdm(total=total, desc=desc, unit=unit, mininterval=1.0, disable=disable)
+
+
+def _progress(agent: Learner, folder: RunFolder, number: int, bar: tqdm[Any], stage: str) -> Progress:
+    """Returns where a stage of a round goes on from, and counts what had been done of it before."""
+
+    def skipped(iterations: int) -> None:
+        agent.num_iterations += iterations
+        bar.update(iterations)
+
+    return Progress(folder.progress(number, stage), skipped)

@@ -1,0 +1,154 @@
+"""What an agent has learnt, and how it acts on it: the parts of Algorithm 2 for one kind of agent."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from famle_agent.adaptation.adapters import EmbeddingAdapter, GradientAdapter
+from famle_agent.adaptation.controller import Adapter, Controller, OnlineState
+from famle_agent.adaptation.memory import Memory
+from famle_agent.agents.config import Config
+from famle_agent.agents.world_model import Interface, ModelBuilder, WorldModel
+from famle_agent.models.dynamics import Dynamics
+from famle_agent.planning import RewardFn
+from famle_agent.utils.errors import NotLearnedError
+
+__all__ = ["AdaptivePolicy"]
+
+
+class AdaptivePolicy:
+    """Plans with a model that is adapted all the time.
+
+    Args:
+        config: All settings.
+        adapter_class: What adapts the model; a gradient adapter has no use for more than one embedding.
+        device: Where models compute.
+        reward_fn: The reward that the user has given; None takes the environment's or the learnt one.
+
+    Attributes:
+        robot: What the robot's observations and actions are; None where no robot is known yet.
+        world: What was meta-learned; None before that.
+        env_reward_fn: The environment's reward, if it names one.
+        not_taken: By what a shipped model differs from what was asked for.
+        seed: Seed of the minibatches of an adaptation.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        adapter_class: type[EmbeddingAdapter | GradientAdapter],
+        device: torch.device,
+        reward_fn: RewardFn | None,
+    ) -> None:
+        self.config, self.adapter_class, self.device, self.user_reward_fn = config, adapter_class, device, reward_fn
+        self.robot: Interface | None = None
+        self.world: WorldModel | None = None
+        self.env_reward_fn: RewardFn | None = None
+        self.not_taken: list[str] = []
+        self.seed = 0
+        self._known_adapter: tuple[tuple[Any, ...], Adapter] | None = None
+
+    @property
+    def builder(self) -> ModelBuilder:
+        """Makes models for the robot.
+
+        Raises:
+            ValueError: No robot is known.
+        """
+        if self.robot is None:
+            raise ValueError("The agent has no environment, so that it knows no robot; make it with one.")
+        shared = issubclass(self.adapter_class, GradientAdapter)
+        return ModelBuilder(self.config.model, self.robot, self.device, shared)
+
+    @property
+    def model(self) -> Dynamics:
+        """The meta-learned model.
+
+        Raises:
+            NotLearnedError: There is none yet.
+        """
+        if self.world is None:
+            shipped = ""
+            if self.not_taken and "kind of agent" not in self.not_taken:
+                shipped = f" The model that is shipped has another {', '.join(self.not_taken)}."
+            raise NotLearnedError(f"This agent has no model yet.{shipped} Call meta_learn() first, or load(path).")
+        return self.world.dynamics
+
+    @property
+    def adapter(self) -> Adapter:
+        """What adapts the model.
+
+        Raises:
+            NotLearnedError: There is no model yet.
+        """
+        model = self.model
+        # A tensor counts how often it was written to: learning, loading and set_parameters change a model in place.
+        version = model.embeddings._version  # noqa: SLF001 - the tensor's own count has no public name
+        known = model, version, self.config, self.seed
+        if self._known_adapter is None or self._known_adapter[0] != known:
+            self._known_adapter = known, self.adapter_class(model, self.config.adaptation, self.seed)
+        return self._known_adapter[1]
+
+    @property
+    def controller(self) -> Controller:
+        """Algorithm 2 with the agent's adapter, planner and reward.
+
+        Raises:
+            NotLearnedError: There is no model yet.
+            ValueError: There is no reward.
+        """
+        adapter, how = self.adapter, self.config.adaptation
+        reward_fn = self.unit_reward_fn()
+        return Controller(adapter, self.config.planner, reward_fn, how.every, how.at_reset, how.forget_at_reset)
+
+    def initial(self, robots: int) -> OnlineState:
+        """Returns the state of B robots that have seen nothing.
+
+        Raises:
+            NotLearnedError: There is no model yet.
+        """
+        model, how = self.model, self.config.adaptation
+        candidates = self.adapter.initial(1).log_posterior.shape[1]
+        device, sizes = model.embeddings.device, (how.memory_size, model.obs_dim, model.action_dim, candidates)
+        return self.controller.init(Memory.empty(robots, *sizes, device, how.window))
+
+    def stored_state(self, tensors: dict[str, Tensor], counts: dict[str, int]) -> OnlineState | None:
+        """Returns the state that a file holds, for the settings of now; None where they cannot go on from it."""
+        how = self.config.adaptation
+        state = OnlineState.from_tensors({name: value.to(self.device) for name, value in tensors.items()}, **counts)
+        state = state.resized(how.memory_size, how.window, self.config.planner.horizon)
+        # With other candidates than the stored agent's, what it has seen cannot be judged by what it knew of them.
+        if state.belief.log_posterior.shape == self.adapter.initial(state.robots).log_posterior.shape:
+            return state
+        warnings.warn(
+            "What the stored agent believed of its robot is left behind: it told other situations apart than these "
+            "settings do (compose). The agent begins with what it meta-learned.",
+            stacklevel=4,
+        )
+        return None
+
+    @property
+    def known_reward_fn(self) -> RewardFn | None:
+        """The user's reward function, or the environment's; None where it has to be learnt."""
+        return self.user_reward_fn or self.env_reward_fn
+
+    def unit_reward_fn(self) -> RewardFn:
+        """Returns the reward r(s, a, s') of actions in [-1, 1], the user's, the environment's or the learnt one.
+
+        Raises:
+            ValueError: There is no reward.
+        """
+        if (known := self.known_reward_fn) is not None:
+            scale = self.builder.action_scale
+
+            def in_model_units(obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
+                return known(obs, scale.from_unit(action), next_obs)
+
+            return in_model_units
+        if self.world is None or self.world.reward is None:
+            raise ValueError("The agent has no reward; give load() the environment (env=...) or a reward_fn.")
+        return self.world.reward
