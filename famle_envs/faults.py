@@ -202,8 +202,9 @@ def make_faulty(
     except gym.error.DependencyNotInstalled as error:
         if "mujoco" not in str(error).lower():
             raise
+        robot = env_id if isinstance(env_id, str) else env_id.id
         raise gym.error.DependencyNotInstalled(
-            f"{env_id} needs MuJoCo, which is not installed; run `pip install 'famle[mujoco]'`."
+            f"{robot} needs MuJoCo, which is not installed; run `pip install 'famle[mujoco]'`."
         ) from error
     if env.has_wrapper_attr("set_situation"):
         env.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import abstractmethod
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from contextlib import closing
 from copy import deepcopy
 from dataclasses import replace
@@ -23,7 +23,7 @@ from typing_extensions import Self
 from famle_agent.agents.algorithm import ModelBasedAlgorithm
 from famle_agent.data.action_scaling import ActionScale
 from famle_agent.data.collect import collect
-from famle_agent.data.envs import EnvLike, SituationEnvs, situation_envs
+from famle_agent.data.envs import SituationEnvs, SituationsLike, situation_envs
 from famle_agent.data.policies import MakePolicy, make_held_uniform, make_planning, reward_names
 from famle_agent.data.transitions import Transitions
 from famle_agent.models.dynamics import Batch, Dynamics
@@ -60,7 +60,7 @@ class SimulationLearner(ModelBasedAlgorithm):
 
     def meta_learn(
         self,
-        envs: Sequence[EnvLike] | Transitions | None = None,
+        envs: SituationsLike | Transitions | None = None,
         callback: MaybeCallback = None,
         tb_log_name: str | None = None,
         progress_bar: bool = False,
@@ -74,9 +74,9 @@ class SimulationLearner(ModelBasedAlgorithm):
         are called once an iteration.
 
         Args:
-            envs: One environment, factory or :class:`~famle_envs.Situation` per situation; None takes the training
-                situations that the agent's environment names. Or :class:`Transitions` that were collected before, which
-                are then all that is learnt from.
+            envs: One environment, factory or :class:`~famle_envs.Situation` per situation, in a list or in a mapping
+                from what each is called; None takes the training situations that the agent's environment names. Or
+                :class:`Transitions` that were collected before, which are then all that is learnt from.
                 List the situation first that the robot is in until it shows otherwise.
             callback: Stable-Baselines3 callbacks, or a function.
             tb_log_name: Name of the run in TensorBoard; by default the class and ``_meta``.
@@ -171,16 +171,14 @@ class SimulationLearner(ModelBasedAlgorithm):
 
         return Progress(folder.progress(number, stage), skipped)
 
-    def collect(
-        self, envs: Sequence[EnvLike] | None = None, progress_bar: bool = False, n_jobs: int = 1
-    ) -> Transitions:
+    def collect(self, envs: SituationsLike | None = None, progress_bar: bool = False, n_jobs: int = 1) -> Transitions:
         """Collects the random transitions that :meth:`meta_learn` learns from; arguments as there."""
         source = self.situation_envs(envs)
         n = self.hyperparameters.transitions_per_situation * len(source.sources)
         with tqdm(total=n, desc="Simulating", unit="step", mininterval=1.0, disable=not progress_bar) as bar:
             return self._simulate(source, 0, n_jobs, None, bar.update)
 
-    def situation_envs(self, envs: Sequence[EnvLike] | None = None) -> SituationEnvs:
+    def situation_envs(self, envs: SituationsLike | None = None) -> SituationEnvs:
         """Makes or takes one environment per training situation; arguments and errors as of :meth:`meta_learn`."""
         return situation_envs(self._require_env(), envs, self.hyperparameters.episode_length)
 
