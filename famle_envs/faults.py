@@ -97,6 +97,7 @@ class FaultWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
             ValueError: The situation is unknown, or this robot cannot have it.
         """
         self._situation = self._resolve(situation)
+        self._label = self._situation.label  # which takes time to put into words
         self._motors.set(self._situation)
         self._sensors.set(self._situation)
         self._change_body()
@@ -124,7 +125,7 @@ class FaultWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
             self._change_body()
         self._lock_joints()
         self._motors.begin()
-        return self._sensors.begin(obs, seed), info | {"situation": self._situation.label}
+        return self._sensors.begin(obs, seed), info | {"situation": self._label}
 
     def step(self, action: Array) -> tuple[Array, Any, bool, bool, dict[str, Any]]:
         """Steps the environment with what the motors make of an action; returns what the sensors read.
@@ -133,7 +134,7 @@ class FaultWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
             ValueError: A motor is broken and the action has the wrong shape. It is clipped to the action space then.
         """
         obs, reward, terminated, truncated, info = self.env.step(self._motors(action))
-        return self._sensors(obs), reward, terminated, truncated, info | {"situation": self._situation.label}
+        return self._sensors(obs), reward, terminated, truncated, info | {"situation": self._label}
 
     @property
     def _robot(self) -> str:
