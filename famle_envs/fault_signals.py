@@ -112,9 +112,9 @@ class SensorFaults:
         """
         if seed is not None:
             self._rng = np.random.default_rng([seed, 1])  # other numbers than those of the environment's generator
-        self._true = np.array(obs, dtype=np.float64)
+        self._true = self._last = np.array(obs, dtype=np.float64)  # a copy: the same array may be filled again
         self._past = _Past(self._delay, self._true)
-        return self._sense(obs, self._true, np.zeros(self._space.shape, dtype=bool))
+        return self._sense(self._true, np.zeros(self._space.shape, dtype=bool)) if self._active else obs
 
     def __call__(self, obs: Array) -> Array:
         """What the sensors read when there is this to be sensed, (n_sensors,)."""
@@ -123,12 +123,9 @@ class SensorFaults:
             self._last = self._true
             return obs
         late, lost = self._past.push(self._true), self._rng.random(self._space.shape) < self._dropout
-        return self._sense(obs, late, lost)
+        return self._sense(late, lost)
 
-    def _sense(self, obs: Array, true: Array, lost: Array) -> Array:
-        if not self._active:
-            self._last = self._true
-            return obs
+    def _sense(self, true: Array, lost: Array) -> Array:
         reading = self._gain * true + self._offset + self._noise * self._rng.standard_normal(self._space.shape)
         turned = np.remainder(reading + math.pi, 2 * math.pi) - math.pi
         reading = np.where(self._is_angle & self._scaled, turned, reading)

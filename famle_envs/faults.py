@@ -166,9 +166,10 @@ class FaultWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
             n_sensors=self._n_sensors,
             n_bodies=0 if self._body is None else self._body.n_bodies,
         )
+        MujocoFaults.check(complete)
         space = _box("action", self.env.action_space)
         for motor, at in enumerate(complete.motor_stuck):
-            if at is not None and not space.low[motor] <= at <= space.high[motor]:
+            if at is not None and not space.low[motor] <= space.dtype.type(at) <= space.high[motor]:
                 raise ValueError(
                     f"motor_stuck must lie in the action space; motor {motor} of {self._robot} goes from "
                     f"{space.low[motor]:g} to {space.high[motor]:g}, got {at:g}."

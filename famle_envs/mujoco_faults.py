@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from famle_envs.arguments import number_within
 from famle_envs.situation import Situation
 
 __all__ = ["MUJOCO_FAULTS", "MujocoFaults", "model_of"]
@@ -22,6 +23,8 @@ _FORCE = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
 _LOCK = ("jnt_limited", "jnt_range", "jnt_margin", "jnt_solref", "jnt_solimp")
 _DERIVED = (*("body_subtreemass", "body_invweight0", "dof_M0", "dof_invweight0", "tendon_invweight0", "actuator_acc0"),)
 """What MuJoCo computes from the masses when it compiles a model."""
+_MULTIPLIERS = (1e-3, 1e3)
+_UNIT = "times the robot's own"
 _LOCK_MARGIN = 0.01  # of both ends of a locked joint's range, so that both hold it (rad or m)
 _LOCK_IMPEDANCE = (0.9999, 0.9999, 0.001, 0.5, 2.0)  # nearly rigid
 _LOCK_TIME = 0.02  # in which a locked joint comes to rest (s)
@@ -64,8 +67,24 @@ class MujocoFaults:
         drives_joint = np.isin(model.actuator_trntype, (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT))
         self._joints = model.actuator_trnid[:, 0].copy()
         one_axis = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+        no_limits = mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+        if model.opt.disableflags & no_limits:
+            return
         if drives_joint.all() and np.isin(model.jnt_type[self._joints], one_axis).all():
             self.supported |= {"locked_joints"}
+
+    @staticmethod
+    def check(situation: Situation) -> None:
+        """Refuses multipliers with which nothing can be simulated.
+
+        Raises:
+            ValueError: One lies outside 0.001 to 1,000.
+        """
+        for name in ("friction", "mass", "base_mass", "damping"):
+            number_within(name, getattr(situation, name), *_MULTIPLIERS, _UNIT)
+        for name in ("body_mass", "motor_strength"):
+            for value in getattr(situation, name):
+                number_within(name, value, *_MULTIPLIERS, _UNIT)
 
     def apply(self, model: Any, situation: Situation) -> None:
         """Makes the model that of a robot in a situation, whose joints all move; see :meth:`lock`."""

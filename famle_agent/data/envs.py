@@ -155,6 +155,7 @@ def situation_envs(env: VecEnv, envs: SituationsLike | None, episode_length: int
         label = situation.label if isinstance(situation, Situation) else f"situation {i}"
         own_names = chain([label], (f"{label} ({j})" for j in count(i)))
         labels.append(names[i] if names else next(name for name in own_names if name not in labels))
+        _check_name(labels[-1])
     return SituationEnvs(sources, labels)
 
 
@@ -171,12 +172,16 @@ def _listed(envs: SituationsLike) -> tuple[list[str], list[EnvLike]]:
     if not isinstance(envs, Mapping):
         return [], list(envs)
     for name in envs:
-        if not isinstance(name, str) or not name.strip() or not name.isprintable():
-            raise ValueError(f"The name of a situation must be a line of text, got {name!r}.")
+        _check_name(name)
     return list(envs), list(envs.values())
 
 
 _ENV_LIKE = (gym.Env, Situation, Mapping, str)
+
+
+def _check_name(name: Any) -> None:
+    if not isinstance(name, str) or not name.strip() or not name.isprintable():
+        raise ValueError(f"The name of a situation must be a line of text, got {name!r}.")
 
 
 def _source(env: VecEnv, item: EnvLike, episode_length: int) -> EnvSource:

@@ -17,7 +17,6 @@ from torch import Tensor
 from famle_agent import FAMLE
 from famle_agent.data.envs import EnvLike
 from famle_envs import Situation
-from famle_envs.faults import FaultWrapper
 
 Array = npt.NDArray[Any]
 MakeEnv = Callable[..., gym.Env[Any, Any]]
@@ -192,50 +191,6 @@ def test_situation_may_be_said_in_many_ways(make_env: MakeEnv) -> None:
     assert agent.collect(given).situations == names
 
 
-def test_keys_of_a_mapping_name_the_situations(make_env: MakeEnv) -> None:
-    agent = pendulum(transitions_per_situation=4)
-    planets = {"earth": lambda: gym.make("Pendulum-v1"), "moon": make_env("Pendulum-v1", g=1.6)}
-    faults = {"lame": Situation(motor_gain=(0.5,), name="not this"), "dead": "motor 0 dead", "on": {"motor_stuck": [1]}}
-    assert agent.collect({**planets, **faults}).situations == ("earth", "moon", "lame", "dead", "on")
-
-
-def test_names_are_what_the_agent_believes_in() -> None:
-    agent = pendulum(transitions_per_situation=20, meta_iterations=2)
-    agent.meta_learn({"earth": lambda: gym.make("Pendulum-v1"), "moon": lambda: gym.make("Pendulum-v1", g=1.6)})
-    assert agent.situations == ("earth", "moon")
-    assert list(agent.posterior()) == ["earth", "moon"]
-
-
-@pytest.mark.parametrize("robot", ["Pendulum-v1", "InvertedPendulum-v5"])
-def test_foreign_robot_breaks_as_ours_do(robot: str) -> None:
-    agent = FAMLE(robot, seed=0, device="cpu", transitions_per_situation=20)
-    data = agent.collect(["motor 0 dead", Situation(motor_stuck=(1.0,))])
-    assert data.situations == ("joint 0 dead", "motor 0 stuck at 1")
-    speed = np.abs(data.obs[..., -1]).mean(axis=1)
-    assert speed[0] < speed[1]
-
-
-def test_broken_robot_keeps_its_task_and_its_angles() -> None:
-    class Tasked(Unregistered):
-        angle_dims = (1,)
-
-        def reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
-            return next_obs[..., 1]
-
-    agent = FAMLE(FaultWrapper(Tasked(), "motor 0 dead, sensor 0 noise 0.1"), device="cpu")
-    assert agent.dims["angle_dims"] == (1,)
-    obs = torch.rand(2, 2)
-    torch.testing.assert_close(agent.unit_reward_fn()(obs, torch.zeros(2, 1), obs), obs[:, 1])
-
-
-def test_broken_robot_is_trained_on_the_faults_of_its_motors(make_env: MakeEnv) -> None:
-    env = FaultWrapper(make_env("Pendulum-v1"), "sensor 0 off by 0.1")
-    agent = FAMLE(env, seed=0, device="cpu", transitions_per_situation=4)
-    names = ("intact", "joint 0 dead", "joint 0 at gain 0.5", "joint 0 reversed")
-    assert agent.collect().situations == names
-    assert agent.collect(["sensor 1 frozen"], n_jobs=2).situations == ("sensor 1 frozen",)
-
-
 def test_same_situation_twice_has_two_names(make_env: MakeEnv) -> None:
     agent = FAMLE(make_env(), seed=0, device="cpu", transitions_per_situation=4)
     assert agent.collect(["intact", "intact"]).situations == ("intact", "intact (1)")
@@ -261,9 +216,7 @@ def test_wrappers_of_the_environment_are_not_lost(make_env: MakeEnv) -> None:
 
 
 def test_environment_without_situations_says_what_to_do() -> None:
-    with pytest.raises(ValueError, match=r"Call meta_learn\(envs\) with a list"):
-        pendulum().meta_learn()
-    with pytest.raises(ValueError, match="actuator_faults"):
+    with pytest.raises(ValueError, match=r"Call meta_learn\(envs\) with a list.*actuator_faults"):
         pendulum().meta_learn()
 
 
@@ -282,11 +235,6 @@ def not_an_env() -> str:
         ("FamleReacher-v0", [], "at least one environment"),
         ("FamleReacher-v0", "joint 3 dead", "needs a list .* got str"),
         ("FamleReacher-v0", {"motor_gain": [1, 0]}, "needs a list .* got dict"),
-        ("FamleReacher-v0", {}, "at least one environment"),
-        ("FamleReacher-v0", {"a\nb": "intact"}, r"name of a situation must be a line of text, got 'a\\nb'"),
-        ("FamleReacher-v0", {"": "intact"}, "must be a line of text"),
-        ("FamleReacher-v0", {3: "intact"}, "must be a line of text"),
-        ("Pendulum-v1", ["friction x 2"], "needs a MuJoCo model"),
         ("FamleReacher-v0", Situation(), "needs a list .* got Situation"),
         ("FamleReacher-v0", [None], "got NoneType"),
         ("FamleReacher-v0", [lambda: gym.make("Pendulum-v1")], "must have the agent's spaces"),

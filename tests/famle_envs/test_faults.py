@@ -89,6 +89,12 @@ def test_stuck_motor_does_the_same_whatever_it_is_told() -> None:
     assert commands("motor 1 stuck at 1.5", (1, 1), (2, -1)) == [(1, 1.5), (2, 1.5)]
 
 
+def test_motor_may_be_stuck_at_a_bound_that_is_rounded() -> None:
+    env = Echo()
+    env.action_space = spaces.Box(-0.7, 0.7, (2,), np.float32)  # whose bound is a little less
+    assert FaultWrapper(env, "motor 0 stuck at 0.7").situation.motor_stuck == (0.7, None)
+
+
 def test_late_motor_is_still_until_it_is_told() -> None:
     assert commands("motor 0 delayed by 2 steps", (1, 5), (2, 6), (0.5, 7), (0, 0)) == [(0, 2), (0, 2), (1, 2), (2, 0)]
 

@@ -169,6 +169,18 @@ def test_body_that_does_not_exist_is_refused() -> None:
         make_faulty("InvertedPendulum-v5", "joint 1 locked")
 
 
+@pytest.mark.parametrize(
+    "situation",
+    [
+        *("friction x 1e308", "mass x 1e-320", "base mass x 1e4", "body 1 mass x 1e5", "damping x 1e9"),
+        "motor 0 strength x 1e-4",
+    ],
+)
+def test_multiplier_that_nothing_can_simulate_is_refused(situation: str) -> None:
+    with pytest.raises(ValueError, match=r"between 0.001 and 1000 times the robot's own"):
+        make_faulty("InvertedPendulum-v5", situation)
+
+
 WITHOUT_MUJOCO = """
 import sys
 import famle_envs.faults as faults, gymnasium as gym
