@@ -4,40 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import math
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from numbers import Real
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
+from famle_envs.situation_fields import MULTIPLIERS, PER_PART, angle, entries_of, indices, multiplier
+from famle_envs.situation_text import UnreadableError, describe, read
+
 __all__ = ["Situation", "resolve_situation"]
-
-_GAIN_OF_WORD = {"dead": 0.0, "reversed": -1.0}
-_WORD_OF_GAIN = {gain: word for word, gain in _GAIN_OF_WORD.items()}
-_NUMBER = r"(-?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)"
-_CLAUSES = {
-    "dead": re.compile(r"joint (\d+) dead"),
-    "reversed": re.compile(r"joint (\d+) reversed"),
-    "gain": re.compile(rf"joint (\d+) at gain {_NUMBER}"),
-    "locked": re.compile(r"joint (\d+) locked"),
-    "offset": re.compile(rf"joint (\d+) sensor off by {_NUMBER} (deg|rad)"),
-    "yaw": re.compile(rf"yaw sensor off by {_NUMBER} (deg|rad)"),
-    "friction": re.compile(rf"friction x {_NUMBER}"),
-    "base_mass": re.compile(rf"base mass x {_NUMBER}"),
-}
-
-
-class UnreadableError(ValueError):
-    """A text is no description of a situation."""
 
 
 @dataclass(frozen=True, eq=False)
 class Situation:
     """A circumstance that perturbs the dynamics of a robot. Immutable, hashable, comparable.
 
-    Joints are counted from 0, and a joint beyond the end of a tuple is as built. Two situations are
-    equal when the same things are wrong: the name is a label and takes no part in it.
+    Joints, motors, sensors and bodies are counted from 0; one beyond the end of a tuple is as built. The robots of
+    famle_envs have the first six faults; :mod:`famle_envs.faults` puts all others, and most of these, into any robot.
+    Two situations are equal when the same things are wrong: the name is a label and takes no part in it.
 
     Args:
         motor_gain: Factor on the command of each joint, from -1 (reversed) over 0 (dead) to 1 (intact).
@@ -47,11 +30,21 @@ class Situation:
         friction: Multiplier of the robot's own floor friction, above 0.
         base_mass: Multiplier of the mass of the robot's base, above 0.
         name: What to call the situation; :attr:`label` falls back on its description.
+        motor_strength: Multiplier of the force of each motor, above 0. Unlike a gain, it can exceed 1.
+        motor_delay: By how many steps the command of each motor comes late, 0 to 1,000.
+        motor_stuck: The command that each motor carries out whatever it is told; None for one that obeys.
+        sensor_gain: Factor on each dimension of the observation; 0 is a dead sensor.
+        sensor_offset: Error of each, in its unit.
+        sensor_noise: Standard deviation of the noise on each, in its unit.
+        sensor_delay: By how many steps each comes late, 0 to 1,000.
+        sensor_dropout: Probability that a reading of each is lost and the last one is repeated; 1 is a frozen sensor.
+        mass: Multiplier of the masses of all bodies, above 0.
+        body_mass: Multiplier of the mass of each body, above 0.
+        damping: Multiplier of the damping of all joints, above 0.
 
     Raises:
         TypeError: A field holds something that is not a number, or not a sequence of numbers.
-        ValueError: A value is not finite, a gain lies outside [-1, 1], a multiplier is not above 0,
-            or a joint index is negative.
+        ValueError: A value is not finite or out of its range, or an index is negative.
 
     Example:
         >>> broken = Situation(motor_gain=(-1, 1, 1, 0, 1))
@@ -68,23 +61,26 @@ class Situation:
     friction: float = 1.0
     base_mass: float = 1.0
     name: str = ""
+    _: KW_ONLY
+    motor_strength: tuple[float, ...] = ()
+    motor_delay: tuple[int, ...] = ()
+    motor_stuck: tuple[float | None, ...] = ()
+    sensor_gain: tuple[float, ...] = ()
+    sensor_offset: tuple[float, ...] = ()
+    sensor_noise: tuple[float, ...] = ()
+    sensor_delay: tuple[int, ...] = ()
+    sensor_dropout: tuple[float, ...] = ()
+    mass: float = 1.0
+    body_mass: tuple[float, ...] = ()
+    damping: float = 1.0
 
     def __post_init__(self) -> None:
-        gains = _floats("motor_gain", self.motor_gain)
-        if any(abs(gain) > 1.0 for gain in gains):
-            raise ValueError(
-                f"motor_gain must lie in [-1, 1] for every joint, got {list(gains)}. "
-                "Use -1 for a reversed motor, 0 for a dead one, 1 for an intact one."
-            )
-        object.__setattr__(self, "motor_gain", gains)
-        object.__setattr__(self, "locked_joints", _indices("locked_joints", self.locked_joints))
-        object.__setattr__(self, "joint_offset", _floats("joint_offset", self.joint_offset))
-        object.__setattr__(self, "orientation_error", _wrap(_float("orientation_error", self.orientation_error)))
-        for multiplier in ("friction", "base_mass"):
-            value = _float(multiplier, getattr(self, multiplier))
-            if value <= 0.0:
-                raise ValueError(f"{multiplier} multiplies the robot's own value and must be above 0, got {value}.")
-            object.__setattr__(self, multiplier, value)
+        for name in PER_PART:
+            object.__setattr__(self, name, entries_of(name, getattr(self, name)))
+        object.__setattr__(self, "locked_joints", indices("locked_joints", self.locked_joints))
+        object.__setattr__(self, "orientation_error", angle("orientation_error", self.orientation_error))
+        for name in MULTIPLIERS:
+            object.__setattr__(self, name, multiplier(name, getattr(self, name)))
         if not isinstance(self.name, str):
             raise TypeError(f"name must be a string, got {type(self.name).__name__}.")
 
@@ -104,12 +100,9 @@ class Situation:
         return frozenset(name for name, value in self.canonical().items() if value != _INTACT[name])
 
     def canonical(self) -> dict[str, Any]:
-        """Returns all fields but the name, without the joints at the end of a tuple that are as built."""
+        """Returns all fields but the name, without the parts at the end of a tuple that are as built."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "name"}
-        return values | {
-            "motor_gain": _strip(self.motor_gain, 1.0),
-            "joint_offset": _strip(self.joint_offset, 0.0),
-        }
+        return values | {name: _strip(values[name], entries.as_built) for name, entries in PER_PART.items()}
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Situation):
@@ -120,16 +113,7 @@ class Situation:
         return hash(tuple(self.canonical().values()))
 
     def __str__(self) -> str:
-        clauses = [_describe_gain(joint, gain) for joint, gain in enumerate(self.motor_gain) if gain != 1.0]
-        clauses += [f"joint {joint} locked" for joint in self.locked_joints]
-        clauses += [f"joint {i} sensor off by {_angle(off)}" for i, off in enumerate(self.joint_offset) if off != 0.0]
-        if self.orientation_error != 0.0:
-            clauses.append(f"yaw sensor off by {_angle(self.orientation_error)}")
-        if self.friction != 1.0:
-            clauses.append(f"friction x {_number(self.friction)}")
-        if self.base_mass != 1.0:
-            clauses.append(f"base mass x {_number(self.base_mass)}")
-        return ", ".join(clauses) or "intact"
+        return describe(self.canonical(), _INTACT | {name: entries.as_built for name, entries in PER_PART.items()})
 
     def to_dict(self) -> dict[str, Any]:
         """The fields that differ from an intact robot, and the name, as JSON types."""
@@ -158,9 +142,9 @@ class Situation:
 
     @classmethod
     def from_string(cls, text: str) -> Situation:
-        """Reads what :meth:`__str__` writes.
+        """Reads what :meth:`__str__` writes; a motor may be called a motor or by its joint.
 
-        The tuples end at the last joint mentioned; :meth:`for_robot` completes them.
+        The tuples end at the last part mentioned; :meth:`for_robot` completes them.
 
         Raises:
             TypeError: It is no string.
@@ -168,37 +152,30 @@ class Situation:
         """
         if not isinstance(text, str):
             raise TypeError(f"Expected a description such as 'joint 3 dead', got {type(text).__name__}.")
-        clauses = [clause.strip() for clause in text.split(",")]
-        if clauses == ["intact"]:
-            return cls()
-        gain: dict[int, float] = {}
-        offset: dict[int, float] = {}
-        locked: list[int] = []
-        scalars: dict[str, float] = {}
-        for clause in clauses:
-            kind, groups = _match(clause)
-            if kind in _GAIN_OF_WORD:
-                _say(gain, _joint(groups[0]), _GAIN_OF_WORD[kind], clause)
-            elif kind == "gain":
-                _say(gain, _joint(groups[0]), float(groups[1]), clause)
-            elif kind == "locked":
-                locked.append(_joint(groups[0]))
-            elif kind == "offset":
-                _say(offset, _joint(groups[0]), _radians(groups[1], groups[2]), clause)
-            elif kind == "yaw":
-                _say(scalars, "orientation_error", _radians(groups[0], groups[1]), clause)
+        fields: dict[str, Any] = {}
+        for name, said in read(text).items():
+            if name == "locked_joints":
+                fields[name] = tuple(said)
+            elif name in PER_PART:
+                fields[name] = tuple(said.get(i, PER_PART[name].as_built) for i in range(max(said) + 1))
             else:
-                _say(scalars, kind, float(groups[0]), clause)
-        tuples = {"motor_gain": _dense(gain, 1.0), "locked_joints": tuple(locked), "joint_offset": _dense(offset, 0.0)}
-        return cls.from_dict({**tuples, **scalars})
+                fields[name] = said[0]
+        return cls(**fields)
 
-    def for_robot(self, robot: str, n_joints: int, supported: frozenset[str]) -> Situation:
+    def for_robot(
+        self, robot: str, n_joints: int, supported: frozenset[str], *, n_sensors: int = 0, n_bodies: int = 0
+    ) -> Situation:
         """Completes the situation for a robot and refuses what that robot cannot have.
 
         Args:
             robot: The robot's name, for the messages.
-            n_joints: The number of joints; per-joint fields get this length.
+            n_joints: The number of motorised joints.
             supported: The fields that this robot can have.
+            n_sensors: The dimensions of its observation, where sensors are supported.
+            n_bodies: Its bodies, where their masses are supported.
+
+        Returns:
+            The situation with an entry for each part in all tuples.
 
         Raises:
             ValueError: A field is not supported, a tuple is too long, or a joint does not exist.
@@ -207,20 +184,19 @@ class Situation:
             raise ValueError(
                 f"{robot} cannot have the fault {fault!r}; remove it. It supports: {', '.join(sorted(supported))}."
             )
-        for name in ("motor_gain", "joint_offset"):
-            if len(getattr(self, name)) > n_joints:
-                raise ValueError(
-                    f"{name} speaks of {len(getattr(self, name))} joints; those of {robot} are 0 to {n_joints - 1}."
-                )
+        numbers = {"joint": n_joints, "motor": n_joints, "sensor": n_sensors, "body": n_bodies}
+        complete: dict[str, Any] = {}
+        for name, (part, as_built, _) in PER_PART.items():
+            values, n = getattr(self, name), numbers[part]
+            if len(values) > n > 0:
+                plural = {"body": "bodies"}.get(part, f"{part}s")
+                raise ValueError(f"{name} speaks of {len(values)} {plural}; those of {robot} are 0 to {n - 1}.")
+            complete[name] = values[:n] + (as_built,) * (n - len(values))
         if self.locked_joints and self.locked_joints[-1] >= n_joints:
             raise ValueError(
                 f"locked_joints names joint {self.locked_joints[-1]}; the joints of {robot} are 0 to {n_joints - 1}."
             )
-        return dataclasses.replace(
-            self,
-            motor_gain=_pad(self.motor_gain, n_joints, 1.0),
-            joint_offset=_pad(self.joint_offset, n_joints, 0.0),
-        )
+        return dataclasses.replace(self, **complete)
 
 
 def resolve_situation(
@@ -235,7 +211,7 @@ def resolve_situation(
 
     Raises:
         TypeError: The argument is of no such type.
-        ValueError: The name is neither a preset nor a description.
+        ValueError: The name is neither a preset nor a description, or what it says cannot be.
     """
     if situation is None:
         return Situation()
@@ -252,93 +228,17 @@ def resolve_situation(
     try:
         return Situation.from_string(situation)
     except UnreadableError as error:
+        if not presets:
+            raise
         raise ValueError(
             f"No situation is called {situation!r}{_suggest(situation, list(presets))} Presets: {', '.join(presets)}."
         ) from error
 
 
-def _describe_gain(joint: int, gain: float) -> str:
-    return f"joint {joint} {_WORD_OF_GAIN.get(gain, f'at gain {_number(gain)}')}"
-
-
-def _number(value: float) -> str:
-    """The shortest text that reads back as the same float."""
-    return f"{value:g}" if float(f"{value:g}") == value else repr(value)
-
-
-def _angle(value: float) -> str:
-    """Degrees where they are exact, since people think in them; radians otherwise."""
-    degrees = f"{math.degrees(value):g}"
-    return f"{degrees} deg" if math.radians(float(degrees)) == value else f"{_number(value)} rad"
-
-
-def _radians(number: str, unit: str) -> float:
-    return math.radians(float(number)) if unit == "deg" else float(number)
-
-
-def _match(clause: str) -> tuple[str, tuple[str, ...]]:
-    for kind, pattern in _CLAUSES.items():
-        if match := pattern.fullmatch(clause):
-            return kind, match.groups()
-    raise UnreadableError(f"Cannot read {clause!r}. Write faults like 'joint 3 dead, yaw sensor off by 30 deg'.")
-
-
-def _joint(index: str) -> int:
-    if len(index) > 3:
-        raise ValueError(f"No robot has a joint {index}.")
-    return int(index)
-
-
-def _say(values: dict[Any, float], key: Any, value: float, clause: str) -> None:
-    if key in values:
-        raise ValueError(f"{clause!r} contradicts what was said before it; say one thing of each motor and sensor.")
-    values[key] = value
-
-
-def _dense(values: Mapping[int, float], default: float) -> tuple[float, ...]:
-    return tuple(values.get(joint, default) for joint in range(max(values) + 1)) if values else ()
-
-
-def _pad(values: tuple[float, ...], length: int, default: float) -> tuple[float, ...]:
-    return values + (default,) * (length - len(values))
-
-
-def _strip(values: tuple[float, ...], default: float) -> tuple[float, ...]:
+def _strip(values: tuple[Any, ...], default: Any) -> tuple[Any, ...]:
     while values and values[-1] == default:
         values = values[:-1]
     return values
-
-
-def _wrap(angle: float) -> float:
-    """The same angle in (-pi, pi]."""
-    if not -math.pi < angle <= math.pi:
-        angle = math.remainder(angle, 2 * math.pi)
-    return math.pi if angle <= -math.pi else angle
-
-
-def _float(name: str, value: Any) -> float:
-    if not isinstance(value, Real):
-        raise TypeError(f"{name} must be a number, got {value!r}.")
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise ValueError(f"{name} must be finite, got {number}.")
-    return number
-
-
-def _floats(name: str, values: Sequence[float]) -> tuple[float, ...]:
-    if isinstance(values, (str, bytes, Mapping)) or not hasattr(values, "__iter__"):
-        raise TypeError(f"{name} must be a sequence with one number per joint, got {values!r}.")
-    return tuple(_float(name, value) for value in values)
-
-
-def _indices(name: str, values: Sequence[int]) -> tuple[int, ...]:
-    indices = _floats(name, values)
-    if any(index != int(index) or index < 0 for index in indices):
-        raise ValueError(f"{name} must hold joint indices (0, 1, ...), got {list(values)}.")
-    return tuple(sorted({int(index) for index in indices}))
 
 
 def _suggest(word: str, known: Sequence[str]) -> str:

@@ -20,7 +20,7 @@ class RandomSituation(gym.Wrapper[Array, Array, Array, Array], RecordConstructor
     """Draws a situation at each reset: domain randomisation.
 
     Args:
-        env: A robot of this package.
+        env: A robot of this package, or one in a :class:`~famle_envs.faults.FaultWrapper`.
         situations: To draw from, with equal chance; None takes the robot's training situations.
 
     Raises:
@@ -40,7 +40,7 @@ class RandomSituation(gym.Wrapper[Array, Array, Array, Array], RecordConstructor
         RecordConstructorArgs.__init__(self, situations=situations)
         gym.Wrapper.__init__(self, env)
         if not env.has_wrapper_attr("set_situation"):
-            raise ValueError(f"{env} takes no situation; give one of the robots of famle_envs.")
+            raise ValueError(f"{env} takes no situation; wrap it in famle_envs.faults.FaultWrapper.")
         self.situations = tuple(env.get_wrapper_attr("training_situations") if situations is None else situations)
         if not self.situations:
             raise ValueError("RandomSituation needs at least one situation to draw from.")

@@ -54,6 +54,7 @@ def test_files_that_the_readme_names_are_there() -> None:
         "famle_agent.utils.parallel",
         "famle_agent.agents.famle",
         "famle_envs.situation",
+        "famle_envs.faults",
         "famle_envs.reacher",
         "famle_envs.ant",
         "famle_envs.quadruped",

@@ -35,8 +35,8 @@ from famle_agent.agents.tensorboard import log_adaptations, log_embeddings, log_
 from famle_agent.agents.world_model import Interface
 from famle_agent.data.action_scaling import check_action, check_observation, to_action_space
 from famle_agent.data.envs import (
-    EnvLike,
     SituationEnvs,
+    SituationsLike,
     check_spaces,
     env_attribute,
     env_id,
@@ -270,7 +270,7 @@ class ModelBasedAgent(BaseAlgorithm):
 
     def meta_learn(
         self,
-        envs: Sequence[EnvLike] | Transitions | None = None,
+        envs: SituationsLike | Transitions | None = None,
         callback: MaybeCallback = None,
         tb_log_name: str | None = None,
         progress_bar: bool = False,
@@ -284,9 +284,9 @@ class ModelBasedAgent(BaseAlgorithm):
         ``num_timesteps`` counts steps of the robot and stands still.
 
         Args:
-            envs: One environment, factory or :class:`~famle_envs.Situation` per situation; None takes the training
-                situations that the agent's environment names. Or :class:`Transitions` that were collected before, which
-                are then all that is learnt from.
+            envs: One environment, factory or :class:`~famle_envs.Situation` per situation, in a list or in a mapping
+                from what each is called; None takes the training situations that the agent's environment names. Or
+                :class:`Transitions` that were collected before, which are then all that is learnt from.
                 List the situation first that the robot is in until it shows otherwise.
             callback: Stable-Baselines3 callbacks, or a function.
             tb_log_name: Name of the run in TensorBoard; by default the class and ``_meta``.
@@ -333,16 +333,14 @@ class ModelBasedAgent(BaseAlgorithm):
         hooks.on_training_end()
         return self
 
-    def collect(
-        self, envs: Sequence[EnvLike] | None = None, progress_bar: bool = False, n_jobs: int = 1
-    ) -> Transitions:
+    def collect(self, envs: SituationsLike | None = None, progress_bar: bool = False, n_jobs: int = 1) -> Transitions:
         """Collects the random transitions that :meth:`meta_learn` learns from; arguments as there."""
         source = self.situation_envs(envs)
         n = self.config.simulation.transitions_per_situation * len(source.sources)
         with tqdm(total=n, desc="Simulating", unit="step", mininterval=1.0, disable=not progress_bar) as bar:
             return simulate(self, source, 0, n_jobs, None, bar.update)
 
-    def situation_envs(self, envs: Sequence[EnvLike] | None = None) -> SituationEnvs:
+    def situation_envs(self, envs: SituationsLike | None = None) -> SituationEnvs:
         """Makes or takes one environment per training situation; arguments and errors as of :meth:`meta_learn`."""
         return situation_envs(self._require_env(), envs, self.config.simulation.episode_length)
 

@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from famle_agent.data.policies import reward_names
 from famle_agent.data.transitions import EnvSource
 from famle_agent.planning import RewardFn
+from famle_envs.faults import FaultWrapper, make_faulty
 from famle_envs.profile import Profile
 from famle_envs.situation import Situation
 
@@ -24,6 +25,7 @@ __all__ = [
     "NEW_OBSERVATIONS",
     "EnvLike",
     "SituationEnvs",
+    "SituationsLike",
     "changing_wrappers",
     "check_spaces",
     "env_attribute",
@@ -35,6 +37,8 @@ __all__ = [
 
 EnvLike = gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]] | Situation | Mapping[str, Any] | str
 """An environment, a factory of one, or the situation of one."""
+SituationsLike = Sequence[EnvLike] | Mapping[str, EnvLike]
+"""One per situation; the keys of a mapping are the names of the situations."""
 
 
 def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
@@ -83,6 +87,8 @@ NEW_ACTIONS = frozenset({"RescaleAction", "TransformAction"})
 """The same for actions."""
 _ONLOOKERS = frozenset({"Monitor", "RecordEpisodeStatistics", "RecordVideo", "HumanRendering"})
 """Wrappers that change nothing of what a robot and its agent tell each other."""
+_FAULTS = frozenset({FaultWrapper.class_name()})
+"""What it changes is inside the robot: an observation means the same, be it wrong or not."""
 
 
 def _plain(value: Any) -> Any:
@@ -92,10 +98,10 @@ def _plain(value: Any) -> Any:
     return asdict(value) if isinstance(value, Profile) else value
 
 
-def _plain_spec(env: VecEnv) -> EnvSpec | None:
-    """The spec of a registered environment whose wrappers, if any, only look on."""
+def _plain_spec(env: VecEnv, wrappers: frozenset[str] = _ONLOOKERS) -> EnvSpec | None:
+    """The spec of a registered environment that has no other wrappers than these; by default, that only look on."""
     spec: EnvSpec | None = env.get_attr("spec")[0]
-    if spec is None or not _ONLOOKERS.issuperset(wrapper.name for wrapper in spec.additional_wrappers):
+    if spec is None or not wrappers.issuperset(wrapper.name for wrapper in spec.additional_wrappers):
         return None
     return spec
 
@@ -113,7 +119,7 @@ class SituationEnvs:
     situations: list[str]
 
 
-def situation_envs(env: VecEnv, envs: Sequence[EnvLike] | None, episode_length: int = 0) -> SituationEnvs:
+def situation_envs(env: VecEnv, envs: SituationsLike | None, episode_length: int = 0) -> SituationEnvs:
     """One environment per training situation.
 
     Args:
@@ -122,24 +128,20 @@ def situation_envs(env: VecEnv, envs: Sequence[EnvLike] | None, episode_length: 
         episode_length: Steps that an episode of each must be able to last; 0 asks for no more than their time limit.
 
     Raises:
-        ValueError: No situation is given or known, the environment takes no ``situation``, the spaces of one differ
-            from the agent's, one has a profile other than the simulator's, or ends its episodes too early.
+        ValueError: No situation is given or known, a robot cannot have one, the name of one is not a line of text, the
+            spaces of one differ from the agent's, one has a profile other than the simulator's, or ends its episodes
+            too early.
     """
     if envs is None:
         envs = list(env_attribute(env, "training_situations", ()))
         if not envs:
             raise ValueError(
                 "This environment names no training situations. Call meta_learn(envs) with a list that holds one "
-                "environment, one factory or one Situation per situation."
+                "environment, one factory or one Situation per situation; famle_envs.faults.actuator_faults(env) "
+                "lists the faults of its motors."
             )
-    if isinstance(envs, (str, Mapping, Situation, gym.Env, VecEnv)) or not isinstance(envs, Sequence):
-        raise ValueError(
-            f"meta_learn(envs) needs a list with one environment, factory or Situation per situation, got "
-            f"{type(envs).__name__}; put a single one into a list."
-        )
-    if len(envs) == 0:
-        raise ValueError("meta_learn(envs) needs at least one environment, factory or Situation.")
-    sources, labels = [_source(env, item, episode_length) for item in envs], list[str]()
+    names, items = _listed(envs)
+    sources, labels = [_source(env, item, episode_length) for item in items], list[str]()
     for i, source in enumerate(sources):
         made = source if isinstance(source, gym.Env) else source()
         try:
@@ -151,40 +153,58 @@ def situation_envs(env: VecEnv, envs: Sequence[EnvLike] | None, episode_length: 
             if made is not source:
                 made.close()
         label = situation.label if isinstance(situation, Situation) else f"situation {i}"
-        names = chain([label], (f"{label} ({j})" for j in count(i)))
-        labels.append(next(name for name in names if name not in labels))
+        own_names = chain([label], (f"{label} ({j})" for j in count(i)))
+        labels.append(names[i] if names else next(name for name in own_names if name not in labels))
+        _check_name(labels[-1])
     return SituationEnvs(sources, labels)
+
+
+def _listed(envs: SituationsLike) -> tuple[list[str], list[EnvLike]]:
+    """The names that the user gave to the situations, if any, and what has them."""
+    one = isinstance(envs, Mapping) and not all(callable(x) or isinstance(x, _ENV_LIKE) for x in envs.values())
+    if one or isinstance(envs, (str, Situation, gym.Env, VecEnv)) or not isinstance(envs, (Sequence, Mapping)):
+        raise ValueError(
+            f"meta_learn(envs) needs a list with one environment, factory or Situation per situation, or a mapping "
+            f"from their names to these, got {type(envs).__name__}; put a single one into a list."
+        )
+    if len(envs) == 0:
+        raise ValueError("meta_learn(envs) needs at least one environment, factory or Situation.")
+    if not isinstance(envs, Mapping):
+        return [], list(envs)
+    for name in envs:
+        _check_name(name)
+    return list(envs), list(envs.values())
+
+
+_ENV_LIKE = (gym.Env, Situation, Mapping, str)
+
+
+def _check_name(name: Any) -> None:
+    if not isinstance(name, str) or not name.strip() or not name.isprintable():
+        raise ValueError(f"The name of a situation must be a line of text, got {name!r}.")
 
 
 def _source(env: VecEnv, item: EnvLike, episode_length: int) -> EnvSource:
     if isinstance(item, gym.Env):
         return item
     if isinstance(item, (Situation, Mapping, str)):
-        spec = _plain_spec(env)
+        spec = _plain_spec(env, _ONLOOKERS | _FAULTS)
         if spec is None:
             raise ValueError(
-                "Situations need a registered environment without wrappers; give environments or factories instead."
+                "Situations need a registered environment without wrappers; give environments or factories instead, "
+                "such as lambda: famle_envs.faults.FaultWrapper(MyEnv(), situation)."
             )
         # Who only looks on, as the Monitor that Stable-Baselines3 puts around an environment, is no part of the robot.
         spec = replace(spec, additional_wrappers=())
         if episode_length:
             spec = replace(spec, max_episode_steps=episode_length)
-        return partial(_make_situation, spec, item)
+        return partial(make_faulty, spec, item, render_mode=None)
     if not callable(item):
         raise ValueError(
             f"A situation is an environment, a factory of one, a Situation, a mapping or a name, got "
             f"{type(item).__name__}."
         )
     return partial(_make_from_factory, item)
-
-
-def _make_situation(spec: EnvSpec, situation: Situation | Mapping[str, Any] | str) -> gym.Env[Any, Any]:
-    try:
-        return gym.make(spec, render_mode=None, situation=situation)
-    except TypeError as error:
-        if "unexpected keyword argument 'situation'" not in str(error):
-            raise
-        raise ValueError(f"{spec.id} takes no situation; give environments or factories instead.") from error
 
 
 def _make_from_factory(factory: Callable[[], gym.Env[Any, Any]]) -> gym.Env[Any, Any]:

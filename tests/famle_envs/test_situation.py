@@ -1,6 +1,8 @@
 import dataclasses
 import json
 import math
+import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,8 @@ from hypothesis import strategies as st
 from famle_envs import Situation
 from famle_envs.situation import resolve_situation
 
-ANGLES = st.floats(allow_nan=False, allow_infinity=False)
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+ANGLES = FINITE
 MULTIPLIERS = st.floats(min_value=0.0, exclude_min=True, allow_infinity=False)
 SITUATIONS = st.builds(
     Situation,
@@ -21,6 +24,17 @@ SITUATIONS = st.builds(
     friction=MULTIPLIERS | st.just(1.0),
     base_mass=MULTIPLIERS | st.just(1.0),
     name=st.text(max_size=8),
+    motor_strength=st.lists(MULTIPLIERS, max_size=3),
+    motor_delay=st.lists(st.integers(0, 1000), max_size=3),
+    motor_stuck=st.lists(st.none() | FINITE, max_size=3),
+    sensor_gain=st.lists(FINITE | st.sampled_from([-1, 0, 1]), max_size=3),
+    sensor_offset=st.lists(FINITE, max_size=3),
+    sensor_noise=st.lists(st.floats(min_value=0.0, allow_infinity=False), max_size=3),
+    sensor_delay=st.lists(st.integers(0, 1000), max_size=3),
+    sensor_dropout=st.lists(st.floats(0.0, 1.0) | st.just(1), max_size=3),
+    mass=MULTIPLIERS | st.just(1.0),
+    body_mass=st.lists(MULTIPLIERS, max_size=3),
+    damping=MULTIPLIERS | st.just(1.0),
 )
 ONE_OF_EACH_FAULT = {
     "motor_gain": Situation(motor_gain=(1, 0.5)),
@@ -29,6 +43,17 @@ ONE_OF_EACH_FAULT = {
     "orientation_error": Situation(orientation_error=0.3),
     "friction": Situation(friction=2.0),
     "base_mass": Situation(base_mass=1.5),
+    "motor_strength": Situation(motor_strength=(1, 1.5)),
+    "motor_delay": Situation(motor_delay=(0, 2)),
+    "motor_stuck": Situation(motor_stuck=(None, 0)),
+    "sensor_gain": Situation(sensor_gain=(1, 0.5)),
+    "sensor_offset": Situation(sensor_offset=(0, 0.1)),
+    "sensor_noise": Situation(sensor_noise=(0, 0.1)),
+    "sensor_delay": Situation(sensor_delay=(0, 2)),
+    "sensor_dropout": Situation(sensor_dropout=(0, 0.2)),
+    "mass": Situation(mass=1.5),
+    "body_mass": Situation(body_mass=(1, 1.5)),
+    "damping": Situation(damping=2.0),
 }
 PRESETS = {
     "intact": Situation(name="intact"),
@@ -130,12 +155,32 @@ def test_locked_joints_are_sorted_and_unique() -> None:
         (Situation(joint_offset=(-0.1,)), "joint 0 sensor off by -0.1 rad"),
         (Situation(orientation_error=math.radians(-30.0)), "yaw sensor off by -30 deg"),
         (Situation(friction=0.5, base_mass=2.0), "friction x 0.5, base mass x 2"),
+        (Situation(motor_strength=(1, 1.5)), "motor 1 strength x 1.5"),
+        (Situation(motor_delay=(1, 2)), "motor 0 delayed by 1 step, motor 1 delayed by 2 steps"),
+        (Situation(motor_stuck=(None, -0.5)), "motor 1 stuck at -0.5"),
+        (Situation(sensor_gain=(0, -1, 2)), "sensor 0 dead, sensor 1 reversed, sensor 2 at gain 2"),
+        (Situation(sensor_offset=(0.1,), sensor_noise=(0.2,)), "sensor 0 off by 0.1, sensor 0 noise 0.2"),
+        (Situation(sensor_delay=(0, 3)), "sensor 1 delayed by 3 steps"),
+        (Situation(sensor_dropout=(1, 0.2)), "sensor 0 frozen, sensor 1 loses 0.2 of its readings"),
+        (Situation(mass=2, body_mass=(1, 0.5), damping=3), "body 1 mass x 0.5, mass x 2, damping x 3"),
     ],
     ids=str,
 )
 def test_description_is_readable(situation: Situation, text: str) -> None:
     assert str(situation) == text
     assert Situation.from_string(text) == situation
+
+
+@pytest.mark.parametrize(
+    ("written", "printed"),
+    [
+        ("motor 3 dead", "joint 3 dead"),
+        ("motor 1 at gain 0.5", "joint 1 at gain 0.5"),
+        ("joint 0 dead + joint 1 dead", "joint 0 dead, joint 1 dead"),
+    ],
+)
+def test_other_ways_to_write_a_description_are_read(written: str, printed: str) -> None:
+    assert str(Situation.from_string(written)) == printed
 
 
 def test_label_is_the_name_or_else_the_description() -> None:
@@ -166,6 +211,27 @@ def test_value_that_is_not_finite_is_refused(field: str, value: float) -> None:
 def test_multiplier_not_above_zero_is_refused(field: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"{field} .* above 0"):
         Situation(**{field: value})
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"motor_strength": (0,)}, "motor_strength .* above 0"),
+        ({"motor_delay": (1.5,)}, "whole numbers of steps, 0 to 1000, got 1.5"),
+        ({"sensor_delay": (-1,)}, "whole numbers of steps"),
+        ({"sensor_delay": (1001,)}, "whole numbers of steps"),
+        ({"motor_stuck": (math.nan,)}, "motor_stuck must be finite"),
+        ({"sensor_gain": (math.inf,)}, "sensor_gain must be finite"),
+        ({"sensor_noise": (-0.1,)}, "at least 0, got -0.1"),
+        ({"sensor_dropout": (1.1,)}, r"probabilities in \[0, 1\]"),
+        ({"body_mass": (1, -1)}, "body_mass .* above 0"),
+        ({"mass": 0}, "mass .* above 0"),
+        ({"damping": -1}, "damping .* above 0"),
+    ],
+)
+def test_values_that_cannot_be_are_refused(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Situation(**values)
 
 
 @pytest.mark.parametrize("joint", [-1, 1.5])
@@ -201,7 +267,7 @@ def test_value_of_the_wrong_type_is_refused_by_field(field: str, value: object) 
 
 
 @pytest.mark.parametrize(
-    ("key", "meant"), [("motor_gains", "motor_gain"), ("lock_joints", "locked_joints"), ("mass", "base_mass")]
+    ("key", "meant"), [("motor_gains", "motor_gain"), ("lock_joints", "locked_joints"), ("base_mas", "base_mass")]
 )
 def test_unknown_field_is_refused_with_a_suggestion(key: str, meant: str) -> None:
     with pytest.raises(ValueError, match=f"no field '{key}'; did you mean '{meant}'"):
@@ -214,10 +280,14 @@ def test_unknown_field_unlike_any_other_is_refused_with_the_list_of_fields() -> 
 
 
 @pytest.mark.parametrize(
-    "clause", ["", "joint 3", "joint dead", "joint -1 dead", "joint 1 at gain full", "yaw sensor off by 3"]
+    "clause",
+    [
+        *("", "joint 3", "joint dead", "joint -1 dead", "joint 1 at gain full", "yaw sensor off by 3"),
+        *("sensor 1 off by 3 deg", "motor 2 delayed by 1.5 steps", "motor ٣ dead", "joint 1\ndead", "joint 1 détruit"),
+    ],
 )
 def test_clause_that_cannot_be_read_is_refused_with_an_example(clause: str) -> None:
-    with pytest.raises(ValueError, match=f"Cannot read '{clause}'. Write faults like"):
+    with pytest.raises(ValueError, match=f"Cannot read {re.escape(repr(clause))}. Write faults like"):
         Situation.from_string(f"joint 0 dead, {clause}")
 
 
@@ -254,7 +324,14 @@ def test_for_robot_refuses_an_unsupported_fault_by_name(field: str) -> None:
     supported = frozenset(ONE_OF_EACH_FAULT) - {field}
     with pytest.raises(ValueError, match=f"Arm cannot have the fault '{field}'"):
         ONE_OF_EACH_FAULT[field].for_robot("Arm", 3, supported)
-    assert ONE_OF_EACH_FAULT[field].for_robot("Arm", 3, frozenset({field})) == ONE_OF_EACH_FAULT[field]
+    complete = ONE_OF_EACH_FAULT[field].for_robot("Arm", 3, frozenset({field}), n_sensors=2, n_bodies=2)
+    assert complete == ONE_OF_EACH_FAULT[field]
+
+
+@pytest.mark.parametrize("field", ["sensor_gain", "body_mass"])
+def test_for_robot_refuses_more_values_than_sensors_or_bodies(field: str) -> None:
+    with pytest.raises(ValueError, match=f"{field} speaks of 4 .*; those of Arm are 0 to 1"):
+        Situation(**{field: (0.5,) * 4}).for_robot("Arm", 3, frozenset({field}), n_sensors=2, n_bodies=2)
 
 
 @pytest.mark.parametrize("field", ["motor_gain", "joint_offset"])
