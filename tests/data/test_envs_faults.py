@@ -61,7 +61,7 @@ def test_broken_robot_keeps_its_task_and_its_angles(monkeypatch: pytest.MonkeyPa
         agent = FAMLE(FaultWrapper(env, "motor 0 dead, sensor 0 noise 0.1"), device="cpu")
         assert agent.dims["angle_dims"] == (1,)
         obs = torch.rand(2, 2)
-        torch.testing.assert_close(agent.unit_reward_fn()(obs, torch.zeros(2, 1), obs), obs[:, 1])
+        torch.testing.assert_close(agent.policy.unit_reward_fn()(obs, torch.zeros(2, 1), obs), obs[:, 1])
 
 
 def test_broken_robot_is_trained_on_the_faults_of_its_motors(make_env: MakeEnv) -> None:
