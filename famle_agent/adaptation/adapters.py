@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation.belief import Belief, prior, unadapted
-from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.belief import (
+    Belief,
+    Candidates,
+    choose,
+    filtered_posterior,
+    prior,
+    systematic_sample,
+    unadapted,
+    window_posterior,
+)
 from famle_agent.adaptation.memory import Memory, Sample, minibatches, whole_memory
-from famle_agent.adaptation.posterior import better_explained, filtered_posterior, window_posterior
-from famle_agent.adaptation.update import descend, select
 from famle_agent.models.dynamics import Dynamics
-from famle_agent.models.gradient_steps import InnerLoop
-from famle_agent.planning import Model, bounded
+from famle_agent.models.gradient_steps import Anchor, InnerLoop
+from famle_agent.models.simulator import Simulator
 
-__all__ = ["Adaptation", "EmbeddingAdapter", "GradientAdapter"]
+__all__ = ["Adaptation", "EmbeddingAdapter", "GradientAdapter", "descend", "select"]
+
+_GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)  # multiples of it, less their whole part, fill [0, 1) evenly
 
 
 @dataclass(frozen=True)
@@ -68,13 +77,11 @@ class EmbeddingAdapter:
     def __post_init__(self) -> None:
         object.__setattr__(self, "candidates", Candidates.of(self.model, self.settings.compose))
 
-    @property
-    def members(self) -> int:
-        """See :class:`~famle_agent.adaptation.controller.Adapter`, here and below."""
-        return self.model.members
-
     def initial(self, robots: int) -> Belief:
-        """Returns theta_meta with the first situation's embedding."""
+        """Returns theta_meta with the first situation's embedding.
+
+        See :class:`~famle_agent.adaptation.controller.Adapter`, here and below.
+        """
         return prior(self.model, self.candidates, robots)
 
     def log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
@@ -84,7 +91,7 @@ class EmbeddingAdapter:
         log_p = power * self.candidates.log_likelihood(self.model, transition)[:, 0]  # (B, C)
         if not self.settings.keep_adapting:
             return log_p, torch.zeros_like(log_p[:, 0])
-        return log_p, power * belief.log_likelihood(self.model, transition)[:, 0]
+        return log_p, power * self.model.log_likelihood(transition, belief.h, belief.theta)[:, 0]
 
     def infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
         """Filters over all transitions where a hazard is set, else takes the likelihood of the last (the paper)."""
@@ -97,15 +104,15 @@ class EmbeddingAdapter:
         """Selects the most likely embedding (line 6), then takes k gradient steps on theta and h (line 7)."""
         start = self._selected(belief)
         if self.settings.keep_adapting:
-            changed = better_explained(memory, start.candidate) & (start.candidate != belief.candidate)
+            changed = memory.better_explained(start.candidate) & (start.candidate != belief.candidate)
             memory = memory.begun_anew(changed, self.settings.window, start.candidate)
             start = start.where(changed, replace(belief, adaptations=start.adaptations))
         return memory, gradient_steps(self.model, start, memory, self.settings, self.seed)
 
-    def model_for(self, belief: Belief, memory: Memory) -> Model:
+    def model_for(self, belief: Belief, memory: Memory) -> Simulator:
         """Returns theta* and h*; where steps go on, the embedding alone as long as it explains the robot better."""
         if self.settings.keep_adapting:
-            better = better_explained(memory, belief.log_posterior.argmax(dim=1))
+            better = memory.better_explained(belief.log_posterior.argmax(dim=1))
             if better.any():
                 belief = replace(self._selected(belief).where(better, belief), adaptations=belief.adaptations)
         return simulator_of(self.model, belief, memory, self.settings.clamp_predictions)
@@ -128,13 +135,8 @@ class GradientAdapter:
     settings: Adaptation
     seed: int
 
-    @property
-    def members(self) -> int:
-        """See :class:`~famle_agent.adaptation.controller.Adapter`, here and below."""
-        return self.model.members
-
     def initial(self, robots: int) -> Belief:
-        """Returns theta_meta."""
+        """Returns theta_meta. See :class:`~famle_agent.adaptation.controller.Adapter`, here and below."""
         return unadapted(self.model, torch.zeros(1, device=self.model.embeddings.device), robots)
 
     def log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
@@ -152,7 +154,7 @@ class GradientAdapter:
         start = replace(start, diverged=belief.diverged, adaptations=belief.adaptations + 1)
         return memory, gradient_steps(self.model, start, memory, self.settings, self.seed)
 
-    def model_for(self, belief: Belief, memory: Memory) -> Model:
+    def model_for(self, belief: Belief, memory: Memory) -> Simulator:
         """Returns theta*."""
         return simulator_of(self.model, belief, memory, self.settings.clamp_predictions)
 
@@ -170,10 +172,64 @@ def _sample(size: int, seed: int, number: int, memory: Memory) -> Sample:
     return minibatches(size, torch.Generator(memory.obs.device).manual_seed(1_000_003 * seed + number))
 
 
-def simulator_of(model: Dynamics, belief: Belief, memory: Memory, clamp: bool) -> Model:
+def simulator_of(model: Dynamics, belief: Belief, memory: Memory, clamp: bool) -> Simulator:
     """Returns the dynamics of a belief; with ``clamp``, within the range of the memory once robots have adapted."""
-    simulator = model.simulator(belief.theta, belief.h)
-    if not clamp or belief.adaptations == 0:
-        return simulator
-    low, high = (bound.repeat_interleave(model.members, dim=0) for bound in memory.range())
-    return bounded(simulator, low, high)
+    within = memory.range() if clamp and belief.adaptations > 0 else None
+    return Simulator(model, belief.h, belief.theta, within)
+
+
+def select(model: Dynamics, candidates: Candidates, belief: Belief, spread: bool = False) -> Belief:
+    """Line 6: theta_meta with the most likely embedding, h_likely = argmax log p(D_M | theta_meta, h).
+
+    Args:
+        model: Holds theta_meta.
+        candidates: The embeddings to select from.
+        belief: Its posterior counts.
+        spread: Whether the members of the ensemble begin with candidates that are sampled from the posterior, others
+            each time, instead of all with the most likely one. A plan has to be good then in several situations that
+            may be the case, and a robot that is stuck tries what it would do in another one.
+    """
+    likeliest = belief.log_posterior.argmax(dim=1)  # (B,)
+    likely = likeliest[:, None]
+    if spread:
+        offset = belief.adaptations * _GOLDEN_RATIO % 1.0
+        likely = systematic_sample(belief.posterior, model.members, offset)  # (B, P)
+    theta_meta = model.theta_of(len(likely))
+    return Belief(
+        theta_meta, candidates.chosen(likely), belief.log_posterior, likeliest, belief.diverged, belief.adaptations + 1
+    )
+
+
+@torch.no_grad()
+def descend(
+    model: Dynamics,
+    start: Belief,
+    memory: Memory,
+    inner_loop: InnerLoop,
+    validation_size: int = 0,
+    sample: Sample = whole_memory,
+) -> Belief:
+    """Line 7: theta*, h* = k gradient steps from where a belief is, each member of the ensemble by itself.
+
+    Args:
+        model: Says what the parameters mean.
+        start: Its theta and h are where the steps begin, and stay where they diverge, which is counted.
+        memory: D_M.
+        inner_loop: The k steps; theta_meta is their anchor.
+        validation_size: The newest transitions, which no gradient step sees. Steps that do not make them more likely
+            are taken back, in each member of the ensemble by itself; 0 trusts all steps, as the paper does.
+        sample: Chooses the transitions of each step among those it may see.
+    """
+    if inner_loop.steps == 0:
+        return start
+    seen, newest = memory.split(validation_size)
+    n = seen.weight.sum(dim=1)
+    anchor = Anchor(model.theta_of(len(n)), n) if inner_loop.decay else None
+    theta, h, _ = inner_loop(model, start.theta, start.h, sample(model, seen), anchor)
+    if validation_size:
+        batch = whole_memory(model, newest)()
+        better = model.loss(batch, h, theta) < model.loss(batch, start.h, start.theta)  # (B, P)
+        theta = {name: choose(better, value, start.theta[name]) for name, value in theta.items()}
+        h = choose(better, h, start.h)
+    adapted = replace(start, theta=theta, h=h)
+    return adapted.where(adapted.is_finite(), replace(start, diverged=start.diverged + 1))

@@ -28,7 +28,8 @@ from famle_agent.data.action_scaling import check_action, check_observation, to_
 from famle_agent.data.envs import env_attribute
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import prepare_torch
-from famle_agent.planning import Planner, RewardFn
+from famle_agent.models.reward import RewardFn
+from famle_agent.planning import Planner
 
 if TYPE_CHECKING:
     from importlib.resources.abc import Traversable
@@ -293,8 +294,10 @@ class ModelBasedAgent(SimulationLearner):
             return replace(self._live, last=None)
         model = self.model
         M, W = self.hyperparameters.memory_size, self.hyperparameters.selection_window
-        C = self.adapter.initial(robots).log_posterior.shape[1]
-        return self.controller.init(Memory.empty(robots, M, model.obs_dim, model.action_dim, C, self.device, W))
+        belief = self.adapter.initial(robots)
+        C = belief.log_posterior.shape[1]
+        memory = Memory.empty(robots, M, model.obs_dim, model.action_dim, C, self.device, W)
+        return self.controller.init(belief, memory)
 
     # --- saving and loading -----------------------------------------------------------------------------
 

@@ -31,8 +31,7 @@ from famle_agent.data.envs import (
 )
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.observation import DIMS, ObservationLayout
-from famle_agent.models.reward import LearnedReward
-from famle_agent.planning import RewardFn
+from famle_agent.models.reward import LearnedReward, RewardFn
 from famle_agent.utils.errors import NotLearnedError
 
 if TYPE_CHECKING:

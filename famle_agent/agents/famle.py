@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, cast
 
 from famle_agent.adaptation.adapters import EmbeddingAdapter
-from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.belief import Candidates
 from famle_agent.adaptation.controller import OnlineState
 from famle_agent.agents.agent import ModelBasedAgent
 from famle_agent.agents.tensorboard import log_embeddings

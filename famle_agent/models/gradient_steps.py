@@ -24,11 +24,11 @@ def prepare_torch() -> None:
 
 @dataclass(frozen=True)
 class Anchor:
-    """What B networks are drawn back to, the less the more they have to learn from.
+    """What the networks of B robots are drawn back to, the less the more they have to learn from.
 
     Attributes:
-        theta: theta_anchor, (B, ...).
-        seen: n, the transitions that each network learns from, (B,).
+        theta: theta_anchor, (B, P, ...).
+        seen: n, the transitions that the networks learn from, (B,).
     """
 
     theta: Theta
@@ -65,17 +65,17 @@ class InnerLoop:
     def __call__(
         self, model: Dynamics, theta: Theta, h: Tensor, sample: Callable[[], Batch], anchor: Anchor | None = None
     ) -> tuple[Theta, Tensor, Tensor]:
-        """Takes k steps for B situations at once; they do not influence each other.
+        """Takes k steps for B situations at once, in each member; none of them influences another.
 
         Args:
             model: The model whose loss is descended.
-            theta: Stacked parameters to start from; not changed.
-            h: Embeddings to start from, (B, embedding_dim); not changed.
+            theta: Parameters to start from, (B, P, ...); not changed.
+            h: Embeddings to start from, (B, P, embedding_dim); not changed.
             sample: Gives the data of each step.
             anchor: What theta is drawn back to after each step; None leaves it free.
 
         Returns:
-            theta~, h~ and the loss before each step, (k, B).
+            theta~, h~ and the loss before each step, (k, B, P).
 
         Raises:
             ValueError: There is a decay and no anchor.
@@ -89,12 +89,12 @@ class InnerLoop:
         losses = []
         with torch.enable_grad():
             for _ in range(self.steps):
-                loss = model.loss(theta, h, sample())
+                loss = model.loss(sample(), h, theta)
                 optimizer.zero_grad()
                 loss.sum().backward()  # type: ignore[no-untyped-call]
                 optimizer.step()
                 if anchor is not None:
                     anchor.draw(theta, self.decay)
                 losses.append(loss.detach())
-        history = torch.stack(losses) if losses else h.new_empty(0, len(h))
+        history = torch.stack(losses) if losses else h.new_empty(0, *h.shape[:2])
         return {name: value.detach() for name, value in theta.items()}, h.detach(), history
