@@ -194,10 +194,8 @@ def select(model: Dynamics, candidates: Candidates, belief: Belief, spread: bool
     if spread:
         offset = belief.adaptations * _GOLDEN_RATIO % 1.0
         likely = systematic_sample(belief.posterior, model.members, offset)  # (B, P)
-    theta_meta = model.theta_of(len(likely))
-    return Belief(
-        theta_meta, candidates.chosen(likely), belief.log_posterior, likeliest, belief.diverged, belief.adaptations + 1
-    )
+    theta_meta, h_likely = model.theta_of(len(likely)), candidates.chosen(likely)
+    return Belief(theta_meta, h_likely, belief.log_posterior, likeliest, belief.diverged, belief.adaptations + 1)
 
 
 @torch.no_grad()

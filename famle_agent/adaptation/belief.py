@@ -45,7 +45,7 @@ class Candidates:
         alone = torch.stack([torch.arange(n), torch.zeros(n, dtype=torch.long)], dim=1)
         both = torch.combinations(torch.arange(1, n)) if compose else alone[:0]
         pairs = torch.cat([alone, both]).to(model.embeddings.device)
-        H = model.embeddings.detach().view(model.robots, model.members, n, -1)
+        H = model.embeddings_for(model.robots)
         h = H[:, :, pairs[:, 0]] + H[:, :, pairs[:, 1]] - H[:, :, :1]
         return cls(h, pairs)
 

@@ -57,13 +57,13 @@ class Dynamics(nn.Module):
         angle_dims: Observation dimensions that are angles in rad.
         quaternion_dims: The four observation dimensions of a unit quaternion, or none.
         pose_dims: x, y and heading of a robot on a floor, or none.
-        gate_actions: As for the network, and the same for the next one.
-        interaction_rank: R.
+        gate_actions: Whether the embedding scales the actions; False is the paper's network.
+        interaction_rank: R, of a bilinear map of inputs and embedding; 0 is the paper's network.
         members: P, independent networks with embeddings of their own; 1 is the paper's.
         degrees_of_freedom: Of a Student-t likelihood, which forgives what no model predicts, contacts above all;
             0 is a Gaussian (the paper's).
-        activation: As for the network, and the same for the next one.
-        output_limit: L.
+        activation: Of the hidden layers, ``"silu"`` or ``"relu"``.
+        output_limit: L, which the normalised change cannot exceed; 0 leaves it free.
         normalise_actions: Whether the network sees actions of zero mean and unit deviation over the data, instead of
             actions in [-1, 1].
         initial_weights: ``"normal"``, or ``"uniform"`` as PyTorch has them by itself and so the authors.
@@ -158,8 +158,12 @@ class Dynamics(nn.Module):
 
     def embeddings_of(self, c: Tensor) -> Tensor:
         """Returns the embeddings of situations c (B,) without gradients, (B, P, embedding_dim)."""
-        H = self._of(self.embeddings.detach(), len(c))  # (B, P, N, embedding_dim)
+        H = self.embeddings_for(len(c))
         return H[torch.arange(len(c), device=H.device), :, self.embedding_index(c)]
+
+    def embeddings_for(self, robots: int) -> Tensor:
+        """Returns H for B robots without gradients, (B, P, N, embedding_dim); errors as of :meth:`parameters_of`."""
+        return self._of(self.embeddings.detach(), robots)
 
     def embeddings_by_row(self, c: Tensor) -> Tensor:
         """Returns an embedding for each transition's situation c, (1, P, n) -> (1, P, n, embedding_dim)."""
@@ -213,7 +217,15 @@ class Dynamics(nn.Module):
             x: Normalised inputs, (B, n, inputs), or (B, P, n, inputs) where each member has its own.
             h: Embeddings, (B, P, embedding_dim), or one for each row, (B, P, n, embedding_dim).
             theta: Parameters, (B, P, ...); None takes the model's own.
+
+        Raises:
+            ValueError: The embeddings have another shape, or the model is of other robots.
         """
+        if h.ndim not in (3, 4) or h.shape[1] != self.members:
+            raise ValueError(
+                f"Embeddings must have shape (B, {self.members}, embedding_dim) for a model of {self.members} members, "
+                f"as embeddings_of(situations) gives them; got {tuple(h.shape)}."
+            )
         B, P = h.shape[:2]
         theta = self.parameters_of(B) if theta is None else theta
         x = _with_members(x).expand(B, P, -1, -1)

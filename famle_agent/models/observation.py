@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations_with_replacement
 
 import torch
@@ -53,18 +54,18 @@ class ObservationLayout:
                 f"{', '.join(DIMS)} name dimensions that an observation of {self.obs_dim} has not: {dims}."
             )
 
-    @property
+    @cached_property
     def other_dims(self) -> list[int]:
         """Dimensions that enter as they are."""
         special = {*self.angle_dims, *self.quaternion_dims, *self.pose_dims}
         return [dim for dim in range(self.obs_dim) if dim not in special]
 
-    @property
+    @cached_property
     def quaternion_pairs(self) -> list[tuple[int, int]]:
         """The pairs (i, j) of the products q_i q_j that differ."""
         return list(combinations_with_replacement(range(len(self.quaternion_dims)), 2))
 
-    @property
+    @cached_property
     def n_features(self) -> int:
         """Size of what a model sees."""
         return len(self.other_dims) + 2 * len(self.angle_dims) + len(self.quaternion_pairs)

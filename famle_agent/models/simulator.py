@@ -30,11 +30,19 @@ class Simulator:
         theta: Parameters, (B, P, ...); None takes theta_meta.
         within: Least and largest value of each observed number, (B, obs_dim) each, beyond which nothing is predicted;
             None predicts anything.
+
+    Raises:
+        ValueError: The embeddings have another shape, or the model is of other robots.
     """
 
     def __init__(
         self, model: Dynamics, h: Tensor, theta: Theta | None = None, within: tuple[Tensor, Tensor] | None = None
     ) -> None:
+        if h.ndim != 3 or h.shape[1] != model.members:
+            raise ValueError(
+                f"Embeddings must have shape (B, {model.members}, embedding_dim) for a model of {model.members} "
+                f"members, as embeddings_of(situations) gives them; got {tuple(h.shape)}."
+            )
         self._model, (self._robots, self._members) = model, h.shape[:2]
         theta = model.theta_of(self._robots) if theta is None else theta
         networks = {name: value.flatten(0, 1) for name, value in theta.items()}  # (B * P, ...)

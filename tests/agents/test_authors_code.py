@@ -150,10 +150,10 @@ def test_first_episode_is_lived_with_what_was_meta_learned(load: Load, data: Tra
     for i in range(EPISODE):
         agent.observe(data.obs[3, i], data.action[3, i], data.next_obs[3, i])
         belief = agent.belief
-        assert torch.equal(belief.h, model.embeddings[:, 0])
-        assert all(torch.equal(value, model.theta[name]) for name, value in belief.theta.items())
+        assert torch.equal(belief.h[0], model.embeddings[:, 0])
+        assert all(torch.equal(value[0], model.theta[name]) for name, value in belief.theta.items())
     agent.begin_episode()
-    assert not torch.equal(agent.belief.theta["weight_0"], model.theta["weight_0"])
+    assert not torch.equal(agent.belief.theta["weight_0"][0], model.theta["weight_0"])
     assert model.embeddings[0, agent.belief.posterior.argmax()].sub(agent.belief.h).abs().max() < 0.2
 
 
@@ -166,9 +166,9 @@ def test_steps_are_passes_through_all_that_was_seen(load: Load, rules: list[Inne
 def test_each_step_sees_a_minibatch_of_the_memory(load: Load, monkeypatch: pytest.MonkeyPatch) -> None:
     sizes, loss = [], Dynamics.loss
 
-    def watched(self: Dynamics, theta: Theta, h: torch.Tensor, batch: Batch) -> torch.Tensor:
-        sizes.append((batch.weight.shape[1], batch.weight.min().item()))
-        return loss(self, theta, h, batch)
+    def watched(self: Dynamics, batch: Batch, h: torch.Tensor, theta: Theta) -> torch.Tensor:
+        sizes.append((batch.weight.shape[-1], batch.weight.min().item()))
+        return loss(self, batch, h, theta)
 
     monkeypatch.setattr(Dynamics, "loss", watched)
     counted(load(), "learn", episodes=3)
@@ -223,11 +223,11 @@ def test_only_the_robot_whose_episode_ended_adapts(load: Load, data: Transitions
     agent, other = load(robots=2), 1 - ended
     state = two_robots(agent, data, 5, {4: [robot == ended for robot in range(2)]})
     belief, model = state.belief, agent.model
-    assert torch.equal(belief.h[other], model.embeddings[0, 0])
-    assert not torch.equal(belief.h[ended], model.embeddings[0, 0])
+    assert torch.equal(belief.h[other, 0], model.embeddings[0, 0])
+    assert not torch.equal(belief.h[ended, 0], model.embeddings[0, 0])
     for name, value in belief.theta.items():
-        assert torch.equal(value[other], model.theta[name][0])
-        assert not torch.equal(value[ended], model.theta[name][0])
+        assert torch.equal(value[other], model.theta[name])
+        assert not torch.equal(value[ended], model.theta[name])
     assert state.memory.weight.sum(dim=1).tolist() == ([3, 4] if ended == 0 else [4, 3])
 
 

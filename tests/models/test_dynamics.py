@@ -68,6 +68,14 @@ def test_prediction_is_where_the_targets_lead(model: Dynamics, size: int) -> Non
     torch.testing.assert_close(model.predict(obs, action, h, theta), expected)
 
 
+@pytest.mark.parametrize("shape", [(2, 5), (2, 1, 5), (1, 2, 3, 1, 5)])
+def test_embeddings_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
+    model, h = simple_model(members=2), torch.randn(shape)
+    for call in (lambda: model(torch.randn(2, 3, 5), h), lambda: Simulator(model, h)):
+        with pytest.raises(ValueError, match=r"must have shape \(B, 2, embedding_dim\).*embeddings_of"):
+            call()
+
+
 # --- parameters -------------------------------------------------------------------------------------------
 
 
