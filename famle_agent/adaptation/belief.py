@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -49,7 +50,7 @@ class Candidates:
         h = H[:, :, pairs[:, 0]] + H[:, :, pairs[:, 1]] - H[:, :, :1]
         return cls(h, pairs)
 
-    @property
+    @cached_property
     def log_prior(self) -> Tensor:
         """One fault is as likely as two, (C,); probabilities that sum to 1."""
         single = self.pairs[:, 1] == 0

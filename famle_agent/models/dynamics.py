@@ -154,7 +154,7 @@ class Dynamics(nn.Module):
 
     def theta_of(self, robots: int) -> Theta:
         """Returns theta for B robots without gradients, (B, P, ...); errors as of :meth:`parameters_of`."""
-        return {name: value.detach() for name, value in self.parameters_of(robots).items()}
+        return {name: self._of(value.detach(), robots) for name, value in self.theta.items()}
 
     def embeddings_of(self, c: Tensor) -> Tensor:
         """Returns the embeddings of situations c (B,) without gradients, (B, P, embedding_dim)."""
@@ -176,10 +176,11 @@ class Dynamics(nn.Module):
 
     def _of(self, values: Tensor, robots: int) -> Tensor:
         """Gives values of all networks, (R * P, ...), to B robots, (B, P, ...)."""
-        if self.robots not in (1, robots):
+        if self.robots == 1:
+            return values.expand(robots, *values.shape)
+        if robots != self.robots:
             raise ValueError(f"The model has networks for {self.robots} robots, not for {robots}.")
-        shape = values.shape[1:]
-        return values.view(self.robots, self.members, *shape).expand(robots, -1, *shape)
+        return values.view(robots, -1, *values.shape[1:])
 
     # --- data -------------------------------------------------------------------------------------------
 
