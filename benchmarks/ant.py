@@ -31,6 +31,7 @@ from benchmarks.reporting.report import show
 from benchmarks.task import Task
 from famle_agent import FAMLE, FAMLEWrapper, ModelBasedAgent
 from famle_agent.agents.presets import known_robots
+from famle_agent.models.members import with_members as some_of
 from famle_agent.rollout import Rollout, rollout
 from famle_envs import Situation
 from famle_envs.ant import AntEnv
@@ -116,7 +117,7 @@ def untrained(seed: int) -> Situation:
 def with_members(task: Task, members: int) -> FAMLE:
     """The shipped agent with fewer members."""
     agent = famle(task)
-    agent.dynamics = agent.model.with_members(members)
+    agent.dynamics = some_of(agent.model, members)
     return agent
 
 

@@ -52,7 +52,7 @@ def _as_famle_begins(task: Task) -> tuple[Dynamics, Tensor]:
     agent = shipped(task.robot, task.seed)
     agent.set_env(task.make())
     agent.learn(_IDENTIFIES)
-    return agent.model, agent.belief.h[:, None]
+    return agent.model, agent.belief.h[0][:, None]
 
 
 def _of_the_test_robot(agent: FAMLE, task: Task, n: int) -> Transitions:

@@ -23,15 +23,14 @@ from benchmarks.ant import ADAPTS, damage_of
 from benchmarks.harness import provenance, write_json
 from benchmarks.methods import shipped
 from famle_agent import FAMLE, Transitions
-from famle_agent.adaptation.belief import Belief, prior
-from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.adapters import descend, select
+from famle_agent.adaptation.belief import Belief, Candidates, prior, window_posterior
 from famle_agent.adaptation.memory import Memory
-from famle_agent.adaptation.posterior import window_posterior
-from famle_agent.adaptation.update import adapt
 from famle_agent.data.collect import collect
 from famle_agent.data.policies import make_held_uniform
 from famle_agent.models.dynamics import Batch, Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
+from famle_agent.models.simulator import Simulator
 from famle_envs import Situation
 
 ROLLOUT = 20  # steps of the long error
@@ -99,19 +98,19 @@ def identification(agent: FAMLE, data: Transitions, sizes: Sequence[int]) -> dic
 def errors(model: Dynamics, belief: Belief, data: Transitions, first: int) -> dict[str, float]:
     """Errors from step ``first`` on, as root mean squares in deviations of the observation: 1 and 20 steps ahead."""
     obs, action, next_obs = (torch.as_tensor(v[0, first:]) for v in (data.obs, data.action, data.next_obs))
-    simulator, scale = model.simulator(belief.theta, belief.h), obs.std(dim=0).clamp(min=1e-3)
+    simulator, scale = Simulator(model, belief.h, belief.theta), obs.std(dim=0).clamp(min=1e-3)
     starts = torch.arange(0, len(obs) - ROLLOUT, 5)
-    state = obs[starts].expand(model.members, -1, -1)
+    state = obs[None, starts]
     for t in range(ROLLOUT):
-        state = simulator(state, action[starts + t].expand(model.members, -1, -1))
-    one = simulator(obs.expand(model.members, -1, -1), action.expand(model.members, -1, -1)).mean(dim=0)
+        state = simulator(state, action[None, starts + t])  # (1, P, n, obs_dim)
+    one = simulator(obs[None], action[None]).mean(dim=1)[0]
 
     def distance(predicted: Tensor, true: Tensor) -> float:
         return float(((_towards(predicted, true, model) - true) / scale).square().mean().sqrt())
 
     return {
         "1 step": distance(one, next_obs),
-        f"{ROLLOUT} steps": distance(state.mean(dim=0), next_obs[starts + ROLLOUT - 1]),
+        f"{ROLLOUT} steps": distance(state.mean(dim=1)[0], next_obs[starts + ROLLOUT - 1]),
     }
 
 
@@ -143,7 +142,7 @@ def learning_curve(agent: FAMLE, data: Transitions, seen: Sequence[int]) -> list
                 log_p = candidates.log_likelihood(model, model.encode(obs, action, next_obs))
                 memory = Memory.full(obs, action, next_obs, log_p)
                 belief = replace(belief, log_posterior=window_posterior(candidates, memory))
-                belief = adapt(model, candidates, memory, inner_loop, belief)
+                belief = descend(model, select(model, candidates, belief), memory, inner_loop)
             rows.append({"way": way, "seen": n, **errors(model, belief, data, max(seen))})
     return rows
 

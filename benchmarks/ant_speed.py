@@ -25,7 +25,7 @@ from benchmarks.harness import provenance, write_json
 from benchmarks.methods import shipped
 from benchmarks.speed import in_turn
 from famle_agent import FAMLEWrapper
-from famle_agent.models.dynamics import Batch, Dynamics, expand
+from famle_agent.models.dynamics import Batch, Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.rollout import rollout
 from famle_agent.training.multitask import JointTraining
@@ -104,7 +104,7 @@ def sgd(repeats: int) -> dict[str, float]:
     model = Dynamics(27, 8, SITUATIONS, 5, HIDDEN, gate_actions=False)
     x, y = torch.randn(SITUATIONS, BATCH, 35), torch.randn(SITUATIONS, BATCH, 27)
     batch = Batch(x, y, torch.ones(SITUATIONS, BATCH))
-    theta, h = expand(model.parameters_by_name(), SITUATIONS), model.embeddings.detach()[0]
+    theta, h = model.theta_of(SITUATIONS), model.embeddings_of(torch.arange(SITUATIONS))
     steps = 10
 
     def batched() -> None:

@@ -18,7 +18,7 @@ from rich.console import Console
 from benchmarks import command
 from benchmarks.harness import provenance, write_json
 from famle_agent import FAMLE, Transitions
-from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.belief import Candidates
 from famle_agent.models.dynamics import Dynamics
 
 _BASE, _TIP = 0, slice(10, 12)  # of the reacher's observation

@@ -22,6 +22,7 @@ from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent, Transitions
 from famle_agent.agents.presets import known_robots
 from famle_agent.data.collect import collect
 from famle_agent.data.policies import make_held_uniform
+from famle_agent.models.members import for_robots
 
 __all__ = [
     "META_TRAINED",
@@ -190,7 +191,7 @@ class MetaTrained:
         agent = self._new(task)
         agent.situations, agent.dynamics = many.situations, many.model
         if not is_shipped(task.robot):
-            agent.dynamics = agent.dynamics.for_robots([task.seed % self.networks for task in tasks])
+            agent.dynamics = for_robots(agent.dynamics, [task.seed % self.networks for task in tasks])
         agent.dynamics.to(agent.device)
         return agent
 

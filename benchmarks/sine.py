@@ -36,14 +36,13 @@ from torch import Tensor
 from benchmarks import command
 from benchmarks.harness import Result, provenance, write_json
 from benchmarks.reporting.statistics import interquartile_mean, quartiles
-from famle_agent.adaptation.belief import prior
-from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.adapters import descend, select
+from famle_agent.adaptation.belief import Candidates, prior, window_posterior
 from famle_agent.adaptation.memory import Memory
-from famle_agent.adaptation.posterior import window_posterior
-from famle_agent.adaptation.update import adapt
 from famle_agent.app.plots import style
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
+from famle_agent.models.simulator import Simulator
 from famle_agent.training.maml import MAML
 from famle_agent.training.reptile import Reptile
 
@@ -136,10 +135,10 @@ class Learner:
         data = self.model.encode(points.obs, points.action, points.next_obs, points.weight)
         points = replace(points, log_p=alone.log_likelihood(self.model, data))
         belief = replace(prior(self.model, alone, sines), log_posterior=window_posterior(alone, points))
-        belief = adapt(self.model, alone, points, self.inner_loop, belief)
+        belief = descend(self.model, select(self.model, alone, belief), points, self.inner_loop)
         x = GRID.expand(sines, -1)[..., None]
-        simulator = self.model.simulator(belief.theta, belief.h)
-        return (simulator(x, torch.zeros(sines, len(GRID), 0)) - x)[..., 0].detach()
+        predicted = Simulator(self.model, belief.h, belief.theta)(x, torch.zeros(sines, len(GRID), 0))[:, 0]
+        return (predicted - x)[..., 0].detach()
 
     def errors(self, sines: Sines, points: Memory) -> Tensor:
         """Mean squared error over GRID with the first 3, 4 and 5 points, (3, B); infinite where the steps diverged."""

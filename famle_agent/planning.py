@@ -13,58 +13,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["ICEM", "MPPI", "Judge", "Model", "Planner", "RandomShooting", "RewardFn", "bounded", "imagine", "shift"]
-
-_CANDIDATES_AT_ONCE = {"cpu": 2500, "cuda": 1_000_000}
-"""By kind of device: what stays in a processor's cache over the whole horizon, or fills a GPU."""
+__all__ = ["ICEM", "MPPI", "Judge", "Planner", "RandomShooting", "shift"]
 
 Judge = Callable[[Tensor], Tensor]
 """Candidate actions (B, N, H, action_dim) -> the return of each, (B, N)."""
-
-
-Model = Callable[[Tensor, Tensor], Tensor]
-"""One step of many candidates: (B, N, obs_dim), (B, N, action_dim) -> next observations (B, N, obs_dim)."""
-
-RewardFn = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""r(s, a, s'): (..., obs_dim), (..., action_dim), (..., obs_dim) -> (...)."""
-
-
-def imagine(model: Model, reward_fn: RewardFn, obs: Tensor, actions: Tensor, members: int = 1) -> Tensor:
-    """Sums the rewards of candidate sequences (the paper's eq. 13), a mean over the members of an ensemble.
-
-    A planner finds what a single model is wrong about; that several are wrong in the same way is rarer.
-
-    Args:
-        model: The dynamics of B robots in P models each, (B * P, ...).
-        reward_fn: The reward of a transition.
-        obs: Where the robots are, (B, obs_dim).
-        actions: Candidates in [-1, 1], (B, N, H, action_dim).
-        members: P.
-
-    Returns:
-        The return of each candidate, (B, N); -inf where a model left the finite numbers.
-    """
-    obs, actions = (values.repeat_interleave(members, dim=0) for values in (obs, actions))
-    at_once = _CANDIDATES_AT_ONCE.get(obs.device.type, 2500)
-    parts = torch.split(actions, max(1, at_once // len(actions)), dim=1)
-    returns = torch.cat([_imagine(model, reward_fn, obs, part) for part in parts], dim=1)
-    returns = torch.nan_to_num(returns, nan=-math.inf, posinf=-math.inf, neginf=-math.inf)
-    return returns.view(-1, members, returns.shape[1]).mean(dim=1)
-
-
-def bounded(model: Model, low: Tensor, high: Tensor) -> Model:
-    """A model that predicts nothing outside of a range, (B, obs_dim) each."""
-    return lambda obs, action: model(obs, action).clamp(low[:, None], high[:, None])
-
-
-def _imagine(model: Model, reward_fn: RewardFn, obs: Tensor, actions: Tensor) -> Tensor:
-    state = obs[:, None].expand(-1, actions.shape[1], -1)
-    total = torch.zeros(actions.shape[:2], device=obs.device)
-    for action in actions.unbind(dim=2):
-        next_state = model(state, action)
-        total = total + reward_fn(state, action, next_state)
-        state = next_state
-    return total
 
 
 @dataclass(frozen=True)

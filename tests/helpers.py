@@ -17,11 +17,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from famle_agent import FAMLE, OnlineState, Transitions
-from famle_agent.adaptation.belief import Belief, prior
-from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.adapters import descend, select
+from famle_agent.adaptation.belief import Belief, Candidates, prior, window_posterior
 from famle_agent.adaptation.memory import Memory
-from famle_agent.adaptation.posterior import window_posterior
-from famle_agent.adaptation.update import adapt
 from famle_agent.models.dynamics import Dynamics, Theta
 from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.models.observation import DIMS, ObservationLayout
@@ -167,13 +165,13 @@ def simple_model(**kwargs: Any) -> Dynamics:
 
 
 def random_theta(model: Dynamics, size: int) -> Theta:
-    """Parameters of every member for each of ``size`` robots."""
-    rows = size * model.members
-    return {name: torch.randn(rows, *value.shape[1:]) for name, value in model.parameters_by_name().items()}
+    """Parameters of every member for each of ``size`` robots, (B, P, ...)."""
+    return {name: torch.randn(value.shape) for name, value in model.theta_of(size).items()}
 
 
 def random_h(model: Dynamics, size: int) -> Tensor:
-    return torch.randn(size * model.members, model.embeddings.shape[-1])
+    """An embedding of every member for each of ``size`` robots, (B, P, embedding_dim)."""
+    return torch.randn(size, model.members, model.embeddings.shape[-1])
 
 
 def random_transitions(model: Dynamics, *shape: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -194,6 +192,5 @@ def memory_of(model: Dynamics, candidates: Candidates, obs: Tensor, action: Tens
 def adapted(model: Dynamics, candidates: Candidates, memory: Memory, inner_loop: InnerLoop) -> Belief:
     """Algorithm 2, lines 6 and 7, for robots that have seen nothing but their memory."""
     start = prior(model, candidates, len(memory.weight))
-    return adapt(
-        model, candidates, memory, inner_loop, replace(start, log_posterior=window_posterior(candidates, memory))
-    )
+    likely = replace(start, log_posterior=window_posterior(candidates, memory))
+    return descend(model, select(model, candidates, likely), memory, inner_loop)

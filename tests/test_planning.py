@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from famle_agent.planning import ICEM, MPPI, Planner, RandomShooting, coloured_noise, imagine, shift
+from famle_agent.models.simulator import imagine
+from famle_agent.planning import ICEM, MPPI, Planner, RandomShooting, coloured_noise, shift
 
 PLANNERS = {
     "random shooting": lambda H: RandomShooting(H, candidates=3000),
@@ -217,67 +218,6 @@ def test_equal_returns_are_no_problem(make: Make) -> None:
 
 
 # --- the parts --------------------------------------------------------------------------------------------
-
-
-def test_return_is_the_sum_of_the_rewards() -> None:
-    actions = torch.rand(2, 3, 4, 2)
-    obs = torch.randn(2, 2)
-
-    def reward(state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
-        torch.testing.assert_close(next_state, point_mass(state, action))
-        return state.sum(dim=-1) + 10 * action.sum(dim=-1)
-
-    expected = torch.zeros(2, 3)
-    for b in range(2):
-        for n in range(3):
-            state = obs[b]
-            for action in actions[b, n]:
-                expected[b, n] += state.sum() + 10 * action.sum()
-                state = point_mass(state, action)
-    torch.testing.assert_close(imagine(point_mass, reward, obs, actions), expected)
-
-
-def last_position(_: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
-    return next_obs.sum(dim=-1)
-
-
-@given(st.integers(1, 3), st.integers(1, 4), st.integers(1, 5))
-def test_return_of_an_ensemble_is_the_mean_of_its_members(robots: int, members: int, candidates: int) -> None:
-    torch.manual_seed(0)
-    gain = torch.randn(robots * members, 1, 2)  # index = robot * P + member
-    obs, actions = torch.randn(robots, 2), torch.rand(robots, candidates, 3, 2) * 2 - 1
-    together = imagine(lambda s, a: s + gain * a, last_position, obs, actions, members)
-    alone = [imagine(lambda s, a, m=m: s + gain[m::members] * a, last_position, obs, actions) for m in range(members)]
-    assert together.shape == (robots, candidates)
-    torch.testing.assert_close(together, torch.stack(alone).mean(dim=0), rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_one_member_that_diverges_is_enough(bad: float) -> None:
-    """The worst return for the robot and the candidates that it is of, and for no other."""
-
-    def model(obs: Tensor, action: Tensor) -> Tensor:
-        wrong = torch.tensor([False, True, False, False])[:, None, None] & (action > 0)
-        return torch.where(wrong, bad, obs + action)
-
-    actions = torch.tensor([[[[0.5]], [[-0.5]]]]).expand(2, -1, -1, -1)
-    returns = imagine(model, last_position, torch.zeros(2, 1), actions, members=2)
-    assert returns.tolist() == [[-math.inf, -0.5], [0.5, -0.5]]
-
-
-def test_many_candidates_are_judged_as_a_few() -> None:
-    torch.manual_seed(0)
-    gain, obs, actions = torch.randn(4, 1, 2), torch.randn(2, 2), torch.rand(2, 1500, 2, 2)
-    together = imagine(lambda s, a: s + gain * a, last_position, obs, actions, members=2)
-    parts = [imagine(lambda s, a: s + gain * a, last_position, obs, part, 2) for part in actions.split(100, dim=1)]
-    torch.testing.assert_close(together, torch.cat(parts, dim=1))
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_return_that_is_no_number_is_the_worst(bad: float) -> None:
-    actions = torch.tensor([[[[bad]], [[0.0]]]])
-    total = imagine(point_mass, lambda obs, action, next_obs: action[..., 0], torch.zeros(1, 1), actions)
-    assert total.tolist() == [[-math.inf, 0.0]]
 
 
 def test_shift_moves_on_and_repeats_the_last_action() -> None:

@@ -2,180 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation.belief import Belief, prior, unadapted
-from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.belief import (
+    Belief,
+    Candidates,
+    choose,
+    filtered_posterior,
+    prior,
+    systematic_sample,
+    unadapted,
+    window_posterior,
+)
 from famle_agent.adaptation.memory import Memory, Sample, minibatches, whole_memory
-from famle_agent.adaptation.posterior import better_explained, filtered_posterior, window_posterior
-from famle_agent.adaptation.update import descend, select
+from famle_agent.adaptation.settings import Adaptation, Filter
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
-from famle_agent.planning import Model, bounded
+from famle_agent.models.simulator import Simulator
 
-__all__ = [
-    "Adaptation",
-    "EmbeddingAdapter",
-    "Epochs",
-    "Filter",
-    "GradientAdapter",
-    "GradientSteps",
-    "Steps",
-    "Window",
-]
+__all__ = ["EmbeddingAdapter", "GradientAdapter", "descend", "select"]
 
-
+_GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)  # multiples of it, less their whole part, fill [0, 1) evenly
 _EVERY_SITUATION = "every situation"
-
-
-@dataclass(frozen=True)
-class Window:
-    """The posterior is the likelihood of the newest transitions, as in the paper.
-
-    Attributes:
-        size: How many; 0, the paper's, takes all of the memory.
-    """
-
-    size: int = 0
-
-
-@dataclass(frozen=True)
-class Filter:
-    """The posterior is filtered over all transitions.
-
-    Attributes:
-        hazard: Probability per step that the robot breaks, or is repaired.
-    """
-
-    hazard: float
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.hazard < 1.0:
-            raise ValueError(f"hazard is a probability above 0 and below 1, got {self.hazard!r}.")
-
-
-@dataclass(frozen=True)
-class Steps:
-    """A number of gradient steps.
-
-    Attributes:
-        number: k.
-    """
-
-    number: int = 20
-
-
-@dataclass(frozen=True)
-class Epochs:
-    """As many gradient steps as it takes to see the memory some times, of several robots that of the one with most.
-
-    Attributes:
-        number: How many times.
-    """
-
-    number: int
-
-
-@dataclass(frozen=True)
-class GradientSteps:
-    """The gradient steps of an adaptation (line 7 of Algorithm 2).
-
-    Attributes:
-        length: How many there are.
-        lr: alpha, the rate of theta.
-        embedding_lr: beta, the rate of h.
-        optimizer: ``"sgd"`` (the paper's) or ``"adam"``.
-        decay: c; after n transitions, each step takes theta c / n of the way back to theta_meta, so that it goes far
-            only where much was seen; 0, the paper's, trusts few transitions as much as many.
-        batch_size: Transitions per step, drawn from the memory; 0 takes all, as the paper does.
-        validation_size: The newest transitions of the memory, which the steps do not see and which decide whether the
-            steps are kept; 0 keeps all, as the paper does.
-        keep_adapting: Whether steps go on from where the last ones led, instead of beginning with what was meta-learned
-            each time (the paper's). FAMLE begins anew where another embedding than the one it began with explains the
-            robot better than its adapted model does, with the transitions that selected it alone. Where it is the same
-            embedding, the steps go on, but the embedding alone plans as long as it explains more.
-    """
-
-    length: Steps | Epochs = Steps()
-    lr: float = 1e-3
-    embedding_lr: float = 1e-2
-    optimizer: Literal["sgd", "adam"] = "adam"
-    decay: float = 0.0
-    batch_size: int = 0
-    validation_size: int = 0
-    keep_adapting: bool = False
-
-    def __post_init__(self) -> None:
-        if isinstance(self.length, Epochs) and not self.batch_size:
-            raise ValueError("adapt_epochs needs an adapt_batch_size; adapt_steps counts steps on the whole memory.")
-
-    def inner_loop(self, seen: int) -> InnerLoop:
-        """Returns U^k on the robot.
-
-        Args:
-            seen: Transitions in the memory.
-        """
-        steps = self.length.number
-        if isinstance(self.length, Epochs):
-            steps *= -(-seen // self.batch_size)
-        return InnerLoop(steps, self.lr, self.embedding_lr, self.optimizer, self.decay)
-
-
-@dataclass(frozen=True)
-class Adaptation:
-    """How a model is adapted on the robot.
-
-    Attributes:
-        every: K, robot steps between two adaptations; 0 never adapts while an episode lasts.
-        at_reset: Whether to adapt when an episode ends.
-        memory_size: M, transitions that adaptation looks back on.
-        forget_at_reset: Whether a new episode empties the memory; damage outlasts an episode, so not by default.
-        evidence: What the posterior of the situations rests on.
-        compose: Whether the most likely embedding is looked for among the sums of two training situations too, which
-            stand for both faults at once; the paper has none.
-        likelihood_power: Exponent of the likelihood of a transition; below 1 where errors are not independent of each
-            other, so that one strange moment does not overturn what many have shown. The paper's is 1.
-        spread_members: Whether the members of the ensemble start from situations that are sampled from the posterior,
-            instead of all from the most likely one (the paper's).
-        gradient: The gradient steps on theta and h; None only selects an embedding.
-        clamp_predictions: Whether a plan may imagine no observation beyond the range of those in the memory, as soon as
-            a robot has adapted.
-    """
-
-    every: int = 5
-    at_reset: bool = False
-    memory_size: int = 50
-    forget_at_reset: bool = False
-    evidence: Window | Filter = Window()
-    compose: bool = False
-    likelihood_power: float = 1.0
-    spread_members: bool = False
-    gradient: GradientSteps | None = GradientSteps()
-    clamp_predictions: bool = False
-
-    def __post_init__(self) -> None:
-        if self.at_reset and self.forget_at_reset:
-            raise ValueError("adapt_at_reset learns from what forget_at_reset throws away; choose one of them.")
-        if self.gradient is not None and self.gradient.validation_size >= self.memory_size:
-            raise ValueError(
-                f"validation_size must be below memory_size, {self.memory_size}, or nothing is left to learn from; "
-                f"got {self.gradient.validation_size}."
-            )
-
-    @property
-    def window(self) -> int:
-        """W, how many of the newest transitions the posterior counts where it is a window's."""
-        return (self.evidence.size if isinstance(self.evidence, Window) else 0) or self.memory_size
-
-    @property
-    def keep_adapting(self) -> bool:
-        """Whether there are gradient steps that go on from where the last ones led."""
-        return self.gradient is not None and self.gradient.keep_adapting
 
 
 @dataclass(frozen=True)
@@ -197,13 +50,11 @@ class EmbeddingAdapter:
     def __post_init__(self) -> None:
         object.__setattr__(self, "candidates", Candidates.of(self.model, self.settings.compose))
 
-    @property
-    def members(self) -> int:
-        """See :class:`~famle_agent.adaptation.controller.Adapter`, here and below."""
-        return self.model.members
-
     def initial(self, robots: int) -> Belief:
-        """Returns theta_meta with the first situation's embedding."""
+        """Returns theta_meta with the first situation's embedding.
+
+        See :class:`~famle_agent.adaptation.controller.Adapter`, here and below.
+        """
         return prior(self.model, self.candidates, robots)
 
     def log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
@@ -213,7 +64,7 @@ class EmbeddingAdapter:
         log_p = power * self.candidates.log_likelihood(self.model, transition)[:, 0]  # (B, C)
         if not self.settings.keep_adapting:
             return log_p, torch.zeros_like(log_p[:, 0])
-        return log_p, power * belief.log_likelihood(self.model, transition)[:, 0]
+        return log_p, power * self.model.log_likelihood(transition, belief.h, belief.theta)[:, 0]
 
     def infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
         """Filters over all transitions where a hazard is set, else takes the likelihood of the last (the paper)."""
@@ -226,15 +77,15 @@ class EmbeddingAdapter:
         """Selects the most likely embedding (line 6), then takes k gradient steps on theta and h (line 7)."""
         start = self._selected(belief)
         if self.settings.keep_adapting:
-            changed = better_explained(memory, start.candidate) & (start.candidate != belief.candidate)
+            changed = memory.better_explained(start.candidate) & (start.candidate != belief.candidate)
             memory = memory.begun_anew(changed, self.settings.window, start.candidate)
             start = start.where(changed, replace(belief, adaptations=start.adaptations))
         return memory, gradient_steps(self.model, start, memory, self.settings, self.seed)
 
-    def model_for(self, belief: Belief, memory: Memory) -> Model:
+    def model_for(self, belief: Belief, memory: Memory) -> Simulator:
         """Returns theta* and h*; where steps go on, the embedding alone as long as it explains the robot better."""
         if self.settings.keep_adapting:
-            better = better_explained(memory, belief.log_posterior.argmax(dim=1))
+            better = memory.better_explained(belief.log_posterior.argmax(dim=1))
             if better.any():
                 belief = replace(self._selected(belief).where(better, belief), adaptations=belief.adaptations)
         return simulator_of(self.model, belief, memory, self.settings.clamp_predictions)
@@ -265,13 +116,8 @@ class GradientAdapter:
     settings: Adaptation
     seed: int
 
-    @property
-    def members(self) -> int:
-        """See :class:`~famle_agent.adaptation.controller.Adapter`, here and below."""
-        return self.model.members
-
     def initial(self, robots: int) -> Belief:
-        """Returns theta_meta."""
+        """Returns theta_meta. See :class:`~famle_agent.adaptation.controller.Adapter`, here and below."""
         return unadapted(self.model, torch.zeros(1, device=self.model.embeddings.device), robots)
 
     def log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
@@ -289,7 +135,7 @@ class GradientAdapter:
         start = replace(start, diverged=belief.diverged, adaptations=belief.adaptations + 1)
         return memory, gradient_steps(self.model, start, memory, self.settings, self.seed)
 
-    def model_for(self, belief: Belief, memory: Memory) -> Model:
+    def model_for(self, belief: Belief, memory: Memory) -> Simulator:
         """Returns theta*."""
         return simulator_of(self.model, belief, memory, self.settings.clamp_predictions)
 
@@ -317,10 +163,60 @@ def _sample(size: int, seed: int, number: int, memory: Memory) -> Sample:
     return minibatches(size, torch.Generator(memory.obs.device).manual_seed(1_000_003 * seed + number))
 
 
-def simulator_of(model: Dynamics, belief: Belief, memory: Memory, clamp: bool) -> Model:
+def simulator_of(model: Dynamics, belief: Belief, memory: Memory, clamp: bool) -> Simulator:
     """Returns the dynamics of a belief; with ``clamp``, within the range of the memory once robots have adapted."""
-    simulator = model.simulator(belief.theta, belief.h)
-    if not clamp or belief.adaptations == 0:
-        return simulator
-    low, high = (bound.repeat_interleave(model.members, dim=0) for bound in memory.range())
-    return bounded(simulator, low, high)
+    within = memory.range() if clamp and belief.adaptations > 0 else None
+    return Simulator(model, belief.h, belief.theta, within)
+
+
+def select(model: Dynamics, candidates: Candidates, belief: Belief, spread: bool = False) -> Belief:
+    """Line 6: theta_meta with the most likely embedding, h_likely = argmax log p(D_M | theta_meta, h).
+
+    Args:
+        model: Holds theta_meta.
+        candidates: The embeddings to select from.
+        belief: Its posterior counts.
+        spread: Whether the members of the ensemble begin with candidates that are sampled from the posterior, others
+            each time, instead of all with the most likely one. A plan has to be good then in several situations that
+            may be the case, and a robot that is stuck tries what it would do in another one.
+    """
+    likeliest = belief.log_posterior.argmax(dim=1)  # (B,)
+    likely = likeliest[:, None]
+    if spread:
+        offset = belief.adaptations * _GOLDEN_RATIO % 1.0
+        likely = systematic_sample(belief.posterior, model.members, offset)  # (B, P)
+    theta_meta, h_likely = model.theta_of(len(likely)), candidates.chosen(likely)
+    return Belief(theta_meta, h_likely, belief.log_posterior, likeliest, belief.diverged, belief.adaptations + 1)
+
+
+@torch.no_grad()
+def descend(
+    model: Dynamics,
+    start: Belief,
+    memory: Memory,
+    inner_loop: InnerLoop,
+    validation_size: int = 0,
+    sample: Sample = whole_memory,
+) -> Belief:
+    """Line 7: theta*, h* = k gradient steps from where a belief is, each member of the ensemble by itself.
+
+    Args:
+        model: Says what the parameters mean.
+        start: Its theta and h are where the steps begin, and stay where they diverge, which is counted.
+        memory: D_M.
+        inner_loop: The k steps.
+        validation_size: The newest transitions, which no gradient step sees. Steps that do not make them more likely
+            are taken back, in each member of the ensemble by itself; 0 trusts all steps, as the paper does.
+        sample: Chooses the transitions of each step among those it may see.
+    """
+    if inner_loop.steps == 0:
+        return start
+    seen, newest = memory.split(validation_size)
+    theta, h, _ = inner_loop(model, start.theta, start.h, sample(model, seen))
+    if validation_size:
+        batch = whole_memory(model, newest)()
+        better = model.loss(batch, h, theta) < model.loss(batch, start.h, start.theta)  # (B, P)
+        theta = {name: choose(better, value, start.theta[name]) for name, value in theta.items()}
+        h = choose(better, h, start.h)
+    adapted = replace(start, theta=theta, h=h)
+    return adapted.where(adapted.is_finite(), replace(start, diverged=start.diverged + 1))

@@ -1,25 +1,110 @@
-"""What robots believe about their situation, and the model that they have adapted to it."""
+"""What robots believe about their situation: the embeddings that come into question, and how likely each of them is."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.memory import Memory
 from famle_agent.models.dynamics import Batch, Dynamics, Theta
 
-__all__ = ["Belief", "choose", "prior", "unadapted"]
+__all__ = [
+    "Belief",
+    "Candidates",
+    "choose",
+    "filtered_posterior",
+    "prior",
+    "systematic_sample",
+    "unadapted",
+    "window_posterior",
+]
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The embeddings among which the most likely one is selected: those of the training situations, and their sums.
+
+    Where h enters a model linearly, h_i + h_j - h_0 is the situation with both faults, if h_0 is the intact robot.
+
+    Attributes:
+        h: (R, P, C, embedding_dim), those of the N training situations first; R is 1 where robots share networks.
+        pairs: What each consists of, (C, 2): the situations i and j; j = 0 where it is i alone.
+    """
+
+    h: Tensor
+    pairs: Tensor
+
+    @classmethod
+    def of(cls, model: Dynamics, compose: bool) -> Candidates:
+        """Takes H_meta, and with ``compose`` the sums of two situations other than the first, the intact robot."""
+        n = model.n_situations
+        alone = torch.stack([torch.arange(n), torch.zeros(n, dtype=torch.long)], dim=1)
+        both = torch.combinations(torch.arange(1, n)) if compose else alone[:0]
+        pairs = torch.cat([alone, both]).to(model.embeddings.device)
+        H = model.embeddings_for(model.robots)
+        h = H[:, :, pairs[:, 0]] + H[:, :, pairs[:, 1]] - H[:, :, :1]
+        return cls(h, pairs)
+
+    @cached_property
+    def log_prior(self) -> Tensor:
+        """One fault is as likely as two, (C,); probabilities that sum to 1."""
+        single = self.pairs[:, 1] == 0
+        size = torch.where(single, single.sum(), (~single).sum())
+        return (-size.float().log()).log_softmax(dim=0)
+
+    def marginal(self, posterior: Tensor) -> Tensor:
+        """Computes how likely each training situation is, alone or as a part: (B, C) -> (B, N)."""
+        n = int((self.pairs[:, 1] == 0).sum())
+        total = posterior.clone()[:, :n]
+        both, (i, j) = posterior[:, n:], self.pairs[n:].T
+        return total.index_add(1, i, both).index_add(1, j, both)
+
+    def names(self, situations: Sequence[str]) -> list[str]:
+        """Names the candidates, given the names of the training situations."""
+        return [situations[i] if j == 0 else f"{situations[i]} + {situations[j]}" for i, j in self.pairs.tolist()]
+
+    def chosen(self, index: Tensor) -> Tensor:
+        """Takes a candidate for each robot, (B, 1), or for each member, (B, P), as (B, P, embedding_dim)."""
+        h = self.h.expand(len(index), *self.h.shape[1:])  # (B, P, C, embedding_dim)
+        return h.take_along_dim(index.expand(h.shape[:2])[..., None, None], dim=2)[:, :, 0]
+
+    def log_likelihood(self, model: Dynamics, data: Batch) -> Tensor:
+        """Computes log p(s' | s, a, theta_meta, h) of transitions for each candidate, a mean over the ensemble.
+
+        Args:
+            model: Holds theta_meta.
+            data: Encoded transitions of the B robots, (B, n).
+
+        Returns:
+            (B, n, C); 0 for padding.
+        """
+        robots, n = data.weight.shape
+        owners, C = model.robots, len(self.pairs)
+        sharing = robots // owners  # B robots share the networks, or each has its own
+
+        # The data of all robots that share a network under each candidate, side by side.
+        def rows(values: Tensor) -> Tensor:
+            flat = values.reshape(owners, 1, sharing * n, *values.shape[2:])
+            return flat.expand(owners, C, *flat.shape[2:]).flatten(1, 2)  # (R, C * sharing * n, ...)
+
+        h = self.h.repeat_interleave(sharing * n, dim=2)
+        batch = Batch(rows(data.x), rows(data.y), rows(data.weight))
+        log_p = model.log_likelihood(batch, h, model.theta_of(owners))
+        return log_p.view(owners, C, sharing, n).permute(0, 2, 3, 1).flatten(0, 1)
 
 
 @dataclass(frozen=True)
 class Belief:
-    """What B robots believe about their situation, in each of the P members of the ensemble.
+    """What B robots believe about their situation, and the model that they have adapted to it.
 
     Attributes:
-        theta: theta*, stacked parameters, (B * P, ...).
-        h: h*, (B * P, embedding_dim).
+        theta: theta*, in each of the P members of the ensemble, (B, P, ...).
+        h: h*, (B, P, embedding_dim).
         log_posterior: Log P(candidate | memory) but for a constant, (B, C).
         candidate: The candidate with which theta* and h* began, (B,).
         diverged: How many adaptations of each robot left the finite numbers and were taken back, (B,).
@@ -38,32 +123,25 @@ class Belief:
         """P(candidate | memory), (B, C)."""
         return torch.softmax(self.log_posterior, dim=1)
 
-    def log_likelihood(self, model: Dynamics, data: Batch) -> Tensor:
-        """Log p(s' | s, a, theta*, h*) of the encoded data of the B robots, a mean over the ensemble, (B, n)."""
-        rows = Batch(*(values.repeat_interleave(model.members, dim=0) for values in (data.x, data.y, data.weight)))
-        log_p = model.log_likelihood(self.theta, self.h, rows)
-        return log_p.view(len(self.log_posterior), model.members, -1).mean(dim=1).clamp(min=-1e30)
-
     def is_finite(self) -> Tensor:
-        """For which robots all parameters are finite numbers, (B,)."""
-        robots = len(self.log_posterior)
-        values = [value.reshape(robots, -1) for value in (*self.theta.values(), self.h)]
+        """Says for which robots all parameters are finite numbers, (B,)."""
+        values = [value.flatten(1) for value in (*self.theta.values(), self.h)]
         return torch.cat(values, dim=1).isfinite().all(dim=1)
 
     def where(self, kept: Tensor, other: Belief) -> Belief:
-        """This belief for the robots in ``kept`` (B,), and the other one for the rest."""
-
-        def pick(mine: Tensor, theirs: Tensor) -> Tensor:
-            return choose(kept.repeat_interleave(len(mine) // len(kept)), mine, theirs)
-
-        theta = {name: pick(value, other.theta[name]) for name, value in self.theta.items()}
-        log_posterior = pick(self.log_posterior, other.log_posterior)
-        candidate, diverged = pick(self.candidate, other.candidate), pick(self.diverged, other.diverged)
-        return Belief(theta, pick(self.h, other.h), log_posterior, candidate, diverged, self.adaptations)
+        """Takes this belief for the robots in ``kept`` (B,), and the other one for the rest."""
+        return Belief(
+            {name: choose(kept, value, other.theta[name]) for name, value in self.theta.items()},
+            choose(kept, self.h, other.h),
+            choose(kept, self.log_posterior, other.log_posterior),
+            choose(kept, self.candidate, other.candidate),
+            choose(kept, self.diverged, other.diverged),
+            self.adaptations,
+        )
 
 
 def prior(model: Dynamics, candidates: Candidates, robots: int) -> Belief:
-    """What B robots believe before they have seen anything: theta_meta, and the first situation's embedding."""
+    """Returns what B robots believe before they have seen anything: theta_meta, and the first situation's embedding."""
     return unadapted(model, candidates.log_prior, robots)
 
 
@@ -74,6 +152,44 @@ def unadapted(model: Dynamics, log_prior: Tensor, robots: int) -> Belief:
     return Belief(model.theta_of(robots), model.embeddings_of(none), log_prior, candidate=none, diverged=none)
 
 
-def choose(rows: Tensor, mine: Tensor, theirs: Tensor) -> Tensor:
-    """``mine`` where the row is marked, else ``theirs``."""
-    return torch.where(rows.view(-1, *[1] * (mine.ndim - 1)), mine, theirs)
+def window_posterior(candidates: Candidates, memory: Memory) -> Tensor:
+    """Computes log P(candidate | D_W) but for a constant, (B, C): the paper's likelihood of the last transitions."""
+    return candidates.log_prior + (memory.log_p * memory.judging[..., None]).sum(dim=1)
+
+
+def filtered_posterior(candidates: Candidates, log_posterior: Tensor, log_p: Tensor, hazard: float) -> Tensor:
+    """Computes log P(candidate | all transitions) of a robot that may break at any step, (B, C).
+
+    The forward filter of a hidden Markov model whose state is redrawn from the prior with probability ``hazard``. A
+    window has to forget the robot as it was before it believes in its damage; the filter believes as soon as the
+    new evidence outweighs the hazard.
+
+    Args:
+        candidates: Have a prior.
+        log_posterior: After the transitions before, (B, C).
+        log_p: Log-likelihood of the newest transition under each candidate, (B, C).
+        hazard: Probability of a change per step.
+    """
+    stays = log_posterior.log_softmax(dim=1) + math.log1p(-hazard)
+    return (torch.logaddexp(stays, candidates.log_prior + math.log(hazard)) + log_p).log_softmax(dim=1)
+
+
+def systematic_sample(posterior: Tensor, n: int, offset: float) -> Tensor:
+    """Draws n candidates for each robot, (B, n), each about n times its probability often.
+
+    Systematic resampling, as in a particle filter: the candidates at the quantiles (i + offset) / n.
+
+    Args:
+        posterior: (B, C).
+        n: Size of the sample.
+        offset: In [0, 1).
+    """
+    descending, order = posterior.sort(dim=1, descending=True, stable=True)
+    at = (torch.arange(n, device=posterior.device) + offset) / n
+    index = torch.searchsorted(descending.cumsum(dim=1), at.expand(len(posterior), n).contiguous(), right=True)
+    return order.gather(1, index.clamp(max=posterior.shape[1] - 1))
+
+
+def choose(kept: Tensor, mine: Tensor, theirs: Tensor) -> Tensor:
+    """Takes ``mine`` where ``kept`` is set, else ``theirs``; it has the first axes of both."""
+    return torch.where(kept.view(*kept.shape, *[1] * (mine.ndim - kept.ndim)), mine, theirs)

@@ -14,7 +14,9 @@ from torch import Tensor
 
 from famle_agent.adaptation.belief import Belief
 from famle_agent.adaptation.memory import Memory
-from famle_agent.planning import Model, Planner, RewardFn, imagine, shift
+from famle_agent.models.reward import RewardFn
+from famle_agent.models.simulator import Simulator
+from famle_agent.planning import Planner, shift
 
 __all__ = ["Adapter", "Controller", "OnlineState"]
 
@@ -56,11 +58,11 @@ class OnlineState:
         return {"steps": self.steps, "adaptations": self.belief.adaptations, "adapted_at": self.adapted_at}
 
     def to_tensors(self) -> dict[str, Tensor]:
-        """All but :attr:`last` and the counts, for a checkpoint."""
-        tensors = {f"theta.{name}": value for name, value in self.belief.theta.items()}
+        """All but :attr:`last` and the counts, for a checkpoint; files have robots and members in one axis."""
+        tensors = {f"theta.{name}": value.flatten(0, 1) for name, value in self.belief.theta.items()}
         tensors |= {f"memory.{name}": value for name, value in vars(self.memory).items()}
-        belief = {name: getattr(self.belief, name) for name in ("h", "log_posterior", "candidate", "diverged")}
-        return tensors | belief | {"plan": self.plan}
+        belief = {name: getattr(self.belief, name) for name in ("log_posterior", "candidate", "diverged")}
+        return tensors | belief | {"h": self.belief.h.flatten(0, 1), "plan": self.plan}
 
     @classmethod
     def from_tensors(cls, tensors: dict[str, Tensor], steps: int, adaptations: int, adapted_at: int) -> OnlineState:
@@ -69,18 +71,17 @@ class OnlineState:
         def part(prefix: str) -> dict[str, Tensor]:
             return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
-        h, log_posterior, candidate = (tensors[name] for name in ("h", "log_posterior", "candidate"))
+        log_posterior, candidate = tensors["log_posterior"], tensors["candidate"]
         diverged = tensors.get("diverged", torch.zeros_like(candidate))  # files of version 0.1 do not count
-        belief = Belief(part("theta."), h, log_posterior, candidate, diverged, adaptations)
+        robots = len(candidate)
+        theta = {name: value.view(robots, -1, *value.shape[1:]) for name, value in part("theta.").items()}
+        h = tensors["h"].view(robots, -1, tensors["h"].shape[1])
+        belief = Belief(theta, h, log_posterior, candidate, diverged, adaptations)
         return cls(Memory(**part("memory.")), belief, tensors["plan"], steps=steps, adapted_at=adapted_at)
 
 
 class Adapter(Protocol):
     """Turns what robots have gone through into the model that they plan with."""
-
-    @property
-    def members(self) -> int:
-        """P, the models of each robot; a plan is judged by their mean."""
 
     def initial(self, robots: int) -> Belief:
         """Returns what B robots believe before they have seen anything: theta_meta and a first embedding."""
@@ -94,8 +95,8 @@ class Adapter(Protocol):
     def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
         """Takes lines 6 and 7 of Algorithm 2; returns what of the memory still counts then, too."""
 
-    def model_for(self, belief: Belief, memory: Memory) -> Model:
-        """Returns the dynamics that a belief stands for, B * P of them."""
+    def model_for(self, belief: Belief, memory: Memory) -> Simulator:
+        """Returns the dynamics that a belief stands for."""
 
     def posterior(self, belief: Belief, situations: Sequence[str]) -> dict[str, float]:
         """Returns P(situation | memory) of the first robot by name, given those of the training situations."""
@@ -124,11 +125,11 @@ class Controller:
     adapt_at_reset: bool = False
     forget_at_reset: bool = False
 
-    def init(self, memory: Memory) -> OnlineState:
-        """Returns the state of B robots with an empty memory (line 1)."""
+    def init(self, belief: Belief, memory: Memory) -> OnlineState:
+        """Returns the state of B robots that believe what the adapter says, with an empty memory (line 1)."""
         robots, _, action_dim = memory.action.shape
         plan = torch.zeros(robots, self.planner.horizon, action_dim, device=memory.action.device)
-        return OnlineState(memory, self.adapter.initial(robots), plan)
+        return OnlineState(memory, belief, plan)
 
     def observe(self, state: OnlineState, obs: Tensor, starts: Tensor) -> OnlineState:
         """Adds the transition that ends here to the memory (lines 9 and 10), and adapts every K (lines 4 to 7).
@@ -157,14 +158,12 @@ class Controller:
     ) -> tuple[Tensor, OnlineState]:
         """Plans an action in [-1, 1], (B, action_dim), with the adapted model (line 8)."""
         state = self.reset(state, starts)
-        model, members = self.adapter.model_for(state.belief, state.memory), self.adapter.members
-        action, plan = self.planner.plan(
-            lambda tau: imagine(model, self.reward_fn, obs, tau, members), state.plan, generator
-        )
+        model = self.adapter.model_for(state.belief, state.memory)
+        action, plan = self.planner.plan(lambda tau: model.returns(self.reward_fn, obs, tau), state.plan, generator)
         return action, replace(state, plan=shift(plan), last=(obs, action))
 
     def reset(self, state: OnlineState, starts: Tensor) -> OnlineState:
-        """Voids the plans of the robots in ``starts`` (B,); adapts or empties their memories where it was asked for."""
+        """Voids the plans of the robots in ``starts`` (B,), and adapts or empties memories where asked to."""
         kept = ~starts
         seen = starts & (state.memory.weight.sum(dim=1) > 0)
         if self.adapt_at_reset and seen.any() and state.steps > state.adapted_at:

@@ -114,6 +114,13 @@ class Memory:
         own_log_p = torch.where(rows[:, None], self.explained_by(candidate), self.own_log_p)
         return replace(self, own_log_p=own_log_p, weight=weight)
 
+    def better_explained(self, candidate: Tensor) -> Tensor:
+        """Says where theta_meta with a candidate (B,) explains the newest W transitions better than the beliefs, (B,).
+
+        Both are judged by transitions that no gradient step had seen when they were made.
+        """
+        return ((self.explained_by(candidate) - self.own_log_p) * self.judging).sum(dim=1) > 0.0
+
     def explained_by(self, candidate: Tensor) -> Tensor:
         """The log-likelihood of the newest W transitions under a candidate for each robot (B,), (B, W)."""
         index = candidate[:, None, None].expand(-1, self.log_p.shape[1], 1)
@@ -140,33 +147,35 @@ class Memory:
 
 
 Draw = Callable[[], Batch]
-"""Gives the normalised transitions of the next gradient step, a row for each member of each robot, (B * P, n, ...)."""
+"""Gives the encoded transitions of the next gradient step, of B robots or of each member of their ensembles."""
 
 Sample = Callable[[Dynamics, Memory], Draw]
 """Says what gradient steps on a model see of a memory."""
 
 
 def whole_memory(model: Dynamics, memory: Memory) -> Draw:
-    """All transitions in each step, as in the paper."""
-    data = model.encode(memory.obs, memory.action, memory.next_obs, memory.weight)
-    batch = Batch(*(values.repeat_interleave(model.members, dim=0) for values in (data.x, data.y, data.weight)))
+    """Shows all transitions in each step, as in the paper."""
+    batch = model.encode(memory.obs, memory.action, memory.next_obs, memory.weight)
     return lambda: batch
 
 
 def minibatches(size: int, generator: torch.Generator) -> Sample:
-    """Transitions drawn anew for each step, ``size`` of each row, with repetitions."""
+    """Draws transitions anew for each step, ``size`` for each member of each robot, with repetitions."""
 
     def sample(model: Dynamics, memory: Memory) -> Draw:
-        rows = torch.arange(len(memory.weight), device=memory.weight.device).repeat_interleave(model.members)[:, None]
-        running_number = memory.weight.cumsum(dim=1)[rows[:, 0]]
+        robots, M = memory.weight.shape
+        robot = torch.arange(robots, device=memory.weight.device)[:, None, None]
+        running_number = memory.weight.cumsum(dim=1)  # (B, M)
 
         def draw() -> Batch:
-            chance = torch.rand(len(rows), size, generator=generator, device=generator.device).to(rows.device)
-            nth = (chance * running_number[:, -1:]).floor()
+            shape = (robots, model.members, size)
+            chance = torch.rand(shape, generator=generator, device=generator.device).to(memory.weight.device)
+            nth = (chance * running_number[:, -1:, None]).floor()
             # Of the transitions that count, the nth is where their running number passes n.
-            i = torch.searchsorted(running_number, nth, right=True).clamp(max=memory.weight.shape[1] - 1)
-            drawn = (values[rows, i] for values in (memory.obs, memory.action, memory.next_obs, memory.weight))
-            return model.encode(*drawn)
+            i = torch.searchsorted(running_number, nth.flatten(1), right=True).clamp(max=M - 1).view(shape)
+            return model.encode(
+                *(values[robot, i] for values in (memory.obs, memory.action, memory.next_obs, memory.weight))
+            )
 
         return draw
 

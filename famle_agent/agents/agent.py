@@ -49,7 +49,7 @@ from famle_agent.data.policies import MakePolicy
 from famle_agent.data.transitions import Transitions
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import prepare_torch
-from famle_agent.planning import RewardFn
+from famle_agent.models.reward import RewardFn
 from famle_agent.training.run_folder import RunFolder
 
 __all__ = ["ModelBasedAgent"]

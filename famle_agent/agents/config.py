@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
 from typing import Any
 
-from famle_agent.adaptation.adapters import Adaptation, Epochs, Filter, GradientSteps, Steps, Window
+from famle_agent.adaptation.settings import Adaptation, Epochs, Filter, GradientSteps, Steps, Window
 from famle_agent.agents.world_model import ModelConfig
 from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.planning import ICEM, MPPI, Planner, RandomShooting
@@ -116,6 +116,7 @@ class Config:
             TypeError: A keyword is no setting, or a value is of the wrong type.
             ValueError: A value is out of range, or one that was chosen has no effect beside the others.
         """
+        values = {name: value for name, value in values.items() if name != _UNUSED or value}
         for name, value in values.items():
             if name not in _HINTS:
                 close = difflib.get_close_matches(name, _HINTS, n=1)
@@ -313,7 +314,7 @@ _NAMES: dict[type, dict[str, str]] = {
     Window: {"size": "selection_size"},
     Filter: _same("hazard"),
     GradientSteps: {
-        **{name: f"adapt_{name}" for name in ("lr", "embedding_lr", "optimizer", "decay", "batch_size")},
+        **{name: f"adapt_{name}" for name in ("lr", "embedding_lr", "optimizer", "batch_size")},
         **_same("validation_size", "keep_adapting"),
     },
     Steps: {"number": "adapt_steps"},
@@ -353,6 +354,9 @@ _ONLINE = {
     *("planner", "planning_reward"),
 }
 """Settings of the life on a robot; rounds in simulation plan too, but a model may be used with another planner."""
+
+_UNUSED = "adapt_decay"
+"""A setting of version 0.1 that is 0 in its files."""
 
 _AT_LEAST_ONE = {
     *("transitions_per_situation", "action_hold", "round_transitions", "embedding_dim", "members", "joint_batch_size"),

@@ -14,7 +14,7 @@ from famle_agent.adaptation.memory import Memory
 from famle_agent.agents.config import Config
 from famle_agent.agents.world_model import Interface, ModelBuilder, WorldModel
 from famle_agent.models.dynamics import Dynamics
-from famle_agent.planning import RewardFn
+from famle_agent.models.reward import RewardFn
 from famle_agent.utils.errors import NotLearnedError
 
 __all__ = ["AdaptivePolicy"]
@@ -111,10 +111,9 @@ class AdaptivePolicy:
         Raises:
             NotLearnedError: There is no model yet.
         """
-        model, how = self.model, self.config.adaptation
-        candidates = self.adapter.initial(1).log_posterior.shape[1]
-        device, sizes = model.embeddings.device, (how.memory_size, model.obs_dim, model.action_dim, candidates)
-        return self.controller.init(Memory.empty(robots, *sizes, device, how.window))
+        model, how, belief = self.model, self.config.adaptation, self.adapter.initial(robots)
+        sizes = how.memory_size, model.obs_dim, model.action_dim, belief.log_posterior.shape[1]
+        return self.controller.init(belief, Memory.empty(robots, *sizes, belief.log_posterior.device, how.window))
 
     def stored_state(self, tensors: dict[str, Tensor], counts: dict[str, int]) -> OnlineState | None:
         """Returns the state that a file holds, for the settings of now; None where they cannot go on from it."""

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from famle_agent.data.policies import reward_names
 from famle_agent.data.transitions import EnvSource
-from famle_agent.planning import RewardFn
+from famle_agent.models.reward import RewardFn
 from famle_envs.faults import FaultWrapper, make_faulty
 from famle_envs.profile import Profile
 from famle_envs.situation import Situation

@@ -14,7 +14,9 @@ from torch import Tensor
 
 from famle_agent.data.action_scaling import ActionScale, to_action_space
 from famle_agent.models.dynamics import Dynamics
-from famle_agent.planning import Model, Planner, RewardFn, imagine, shift
+from famle_agent.models.reward import RewardFn
+from famle_agent.models.simulator import Simulator
+from famle_agent.planning import Planner, shift
 
 __all__ = [
     "REWARDS",
@@ -74,14 +76,13 @@ class PlanningPolicy:
 
     def __init__(
         self,
-        model: Model,
-        members: int,
+        model: Simulator,
         reward_fn: RewardFn,
         planner: Planner,
         action_space: gym.spaces.Box,
         generator: torch.Generator,
     ) -> None:
-        self._model, self._members, self._reward_fn = model, members, reward_fn
+        self._model, self._reward_fn = model, reward_fn
         self._planner, self._space, self._generator = planner, action_space, generator
         self._plan: Tensor | None = None
 
@@ -93,7 +94,7 @@ class PlanningPolicy:
         state = torch.as_tensor(obs, dtype=torch.float32)[None]
 
         def judge(tau: Tensor) -> Tensor:
-            return imagine(self._model, self._reward_fn, state, tau, self._members)
+            return self._model.returns(self._reward_fn, state, tau)
 
         action, plan = self._planner.plan(judge, self._plan, self._generator)
         self._plan = shift(plan)
@@ -137,11 +138,8 @@ class make_planning:  # noqa: N801
         scale = ActionScale.of(env.action_space, torch.device("cpu"))  # type: ignore[arg-type]
         own = (env.get_wrapper_attr(name) for name in self.rewards if env.has_wrapper_attr(name))
         in_env_units: RewardFn = self.reward_fn or next(own)
-        h = self.model.embeddings_of(torch.tensor([situation]))
-        simulator = self.model.simulator(self.model.parameters_by_name(), h)
         return PlanningPolicy(
-            simulator,
-            self.model.members,
+            Simulator(self.model, self.model.embeddings_of(torch.tensor([situation]))),
             lambda obs, action, next_obs: in_env_units(obs, scale.from_unit(action), next_obs),
             self.planner,
             env.action_space,  # type: ignore[arg-type]

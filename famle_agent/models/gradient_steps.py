@@ -14,32 +14,12 @@ from torch import Tensor
 
 from famle_agent.models.dynamics import Batch, Dynamics, Theta
 
-__all__ = ["Anchor", "InnerLoop", "prepare_torch"]
+__all__ = ["InnerLoop", "prepare_torch"]
 
 
 def prepare_torch() -> None:
     """Has torch import now what it imports for its first optimizer: seconds for which a robot would stand still."""
     torch.optim.SGD([torch.zeros(1, requires_grad=True)])
-
-
-@dataclass(frozen=True)
-class Anchor:
-    """What B networks are drawn back to, the less the more they have to learn from.
-
-    Attributes:
-        theta: theta_anchor, (B, ...).
-        seen: n, the transitions that each network learns from, (B,).
-    """
-
-    theta: Theta
-    seen: Tensor
-
-    @torch.no_grad()
-    def draw(self, theta: Theta, decay: float) -> None:
-        """Takes theta a part of its way back, in place: theta + min(1, c / n) (theta_anchor - theta)."""
-        part = (decay / self.seen.clamp(min=1.0)).clamp(max=1.0)
-        for name, value in theta.items():
-            value.lerp_(self.theta[name], part.view(-1, *[1] * (value.ndim - 1)))
 
 
 @dataclass(frozen=True)
@@ -51,37 +31,27 @@ class InnerLoop:
         lr: alpha, the rate of theta.
         embedding_lr: beta, the rate of h.
         optimizer: ``"sgd"`` (the paper's) or ``"adam"``.
-        decay: c, how strongly an anchor draws; 0, the paper's, not at all. It is the decay of AdamW (Loshchilov and
-            Hutter, 2019) towards a starting point instead of zero (Li, Grandvalet and Davoine, 2018, "Explicit
-            Inductive Bias for Transfer Learning with Convolutional Networks").
     """
 
     steps: int = 20
     lr: float = 1e-3
     embedding_lr: float = 1e-2
     optimizer: Literal["sgd", "adam"] = "sgd"
-    decay: float = 0.0
 
     def __call__(
-        self, model: Dynamics, theta: Theta, h: Tensor, sample: Callable[[], Batch], anchor: Anchor | None = None
+        self, model: Dynamics, theta: Theta, h: Tensor, sample: Callable[[], Batch]
     ) -> tuple[Theta, Tensor, Tensor]:
-        """Takes k steps for B situations at once; they do not influence each other.
+        """Takes k steps for B situations at once, in each member; none of them influences another.
 
         Args:
             model: The model whose loss is descended.
-            theta: Stacked parameters to start from; not changed.
-            h: Embeddings to start from, (B, embedding_dim); not changed.
+            theta: Parameters to start from, (B, P, ...); not changed.
+            h: Embeddings to start from, (B, P, embedding_dim); not changed.
             sample: Gives the data of each step.
-            anchor: What theta is drawn back to after each step; None leaves it free.
 
         Returns:
-            theta~, h~ and the loss before each step, (k, B).
-
-        Raises:
-            ValueError: There is a decay and no anchor.
+            theta~, h~ and the loss before each step, (k, B, P).
         """
-        if self.decay and anchor is None:
-            raise ValueError(f"A decay of {self.decay} has nothing to draw theta back to; give an anchor, or decay=0.")
         theta = {name: value.detach().clone().requires_grad_() for name, value in theta.items()}
         h = h.detach().clone().requires_grad_()
         groups = [{"params": list(theta.values()), "lr": self.lr}, {"params": [h], "lr": self.embedding_lr}]
@@ -89,12 +59,10 @@ class InnerLoop:
         losses = []
         with torch.enable_grad():
             for _ in range(self.steps):
-                loss = model.loss(theta, h, sample())
+                loss = model.loss(sample(), h, theta)
                 optimizer.zero_grad()
                 loss.sum().backward()  # type: ignore[no-untyped-call]
                 optimizer.step()
-                if anchor is not None:
-                    anchor.draw(theta, self.decay)
                 losses.append(loss.detach())
-        history = torch.stack(losses) if losses else h.new_empty(0, len(h))
+        history = torch.stack(losses) if losses else h.new_empty(0, *h.shape[:2])
         return {name: value.detach() for name, value in theta.items()}, h.detach(), history

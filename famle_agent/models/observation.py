@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations_with_replacement
 
 import torch
@@ -53,18 +54,18 @@ class ObservationLayout:
                 f"{', '.join(DIMS)} name dimensions that an observation of {self.obs_dim} has not: {dims}."
             )
 
-    @property
+    @cached_property
     def other_dims(self) -> list[int]:
         """Dimensions that enter as they are."""
         special = {*self.angle_dims, *self.quaternion_dims, *self.pose_dims}
         return [dim for dim in range(self.obs_dim) if dim not in special]
 
-    @property
+    @cached_property
     def quaternion_pairs(self) -> list[tuple[int, int]]:
         """The pairs (i, j) of the products q_i q_j that differ."""
         return list(combinations_with_replacement(range(len(self.quaternion_dims)), 2))
 
-    @property
+    @cached_property
     def n_features(self) -> int:
         """Size of what a model sees."""
         return len(self.other_dims) + 2 * len(self.angle_dims) + len(self.quaternion_pairs)
@@ -129,37 +130,3 @@ class ObservationLayout:
             return obs[..., self.pose_dims[2]], obs[..., self.pose_dims[3]]
         heading = obs[..., self.pose_dims[2]]
         return heading.sin(), heading.cos()
-
-    def inputs(self, obs: Tensor) -> list[Tensor]:
-        """As :meth:`features` in parts that copy little, for :meth:`weights_for_inputs`; to be concatenated in order.
-
-        All of the observation goes in as it is, and all 16 products of a quaternion instead of the 10 that differ.
-        """
-        parts = [obs]
-        if self.angle_dims:
-            angles = _take(obs, self.angle_dims)
-            parts += [angles.sin(), angles.cos()]
-        if self.quaternion_dims:
-            q = _take(obs, self.quaternion_dims)
-            parts.append((q[..., None] * q[..., None, :]).flatten(-2))
-        return parts
-
-    def weights_for_inputs(self, weight: Tensor) -> Tensor:
-        """First-layer weights for :meth:`inputs` from those for :meth:`features`, (B, n_features, out).
-
-        What enters otherwise or not at all has weights of 0.
-        """
-        other = self.other_dims
-        from_other, angles, products = weight.tensor_split([len(other), len(other) + 2 * len(self.angle_dims)], dim=1)
-        plain = weight.new_zeros(len(weight), self.obs_dim, weight.shape[2])
-        plain[:, other] = from_other
-        square = weight.new_zeros(len(weight), len(self.quaternion_dims) ** 2, weight.shape[2])
-        square[:, [4 * i + j for i, j in self.quaternion_pairs]] = products
-        return torch.cat([plain, angles, square], dim=1)
-
-
-def _take(values: Tensor, dims: tuple[int, ...]) -> Tensor:
-    """Some of the last dimensions; a view where they follow each other."""
-    if dims == tuple(range(dims[0], dims[-1] + 1)):
-        return values[..., dims[0] : dims[-1] + 1]
-    return values[..., list(dims)]

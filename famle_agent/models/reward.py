@@ -1,7 +1,8 @@
-"""The reward of an environment that does not say how it rewards: learnt from simulated transitions."""
+"""Rewards: what they are to a planner, and one that is learnt where an environment does not say how it rewards."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -9,7 +10,10 @@ from torch import Tensor, nn
 
 from famle_agent.models.observation import ObservationLayout
 
-__all__ = ["LearnedReward"]
+__all__ = ["LearnedReward", "RewardFn"]
+
+RewardFn = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""r(s, a, s'): (..., obs_dim), (..., action_dim), (..., obs_dim) -> (...)."""
 
 
 class LearnedReward(nn.Module):

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from famle_agent.models.dynamics import Batch, Dynamics, Theta, expand
+from famle_agent.models.dynamics import Batch, Dynamics, Theta
 from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.training.progress import Progress
 from famle_agent.training.reptile import MetaStep
@@ -79,11 +79,11 @@ class MAML:
         for iteration in left:
             drawn = torch.randperm(n_situations, generator=generator, device=generator.device)
             c = drawn[:meta_batch_size].to(data.x.device)
-            support, query = self.sample(data, c.repeat_interleave(model.members), generator)
+            support, query = self.sample(data, c, model.members, generator)
 
-            theta, h = expand(dict(model.theta.items()), meta_batch_size), model.embeddings_of(c).detach()
+            theta, h = model.parameters_of(meta_batch_size), model.embeddings_of(c)
             theta_tilde, loss_before = self.adapt(model, theta, h, support, inner_loop)
-            loss_after = model.loss(theta_tilde, h, query).mean()
+            loss_after = model.loss(query, h, theta_tilde).mean()
 
             optimizer.zero_grad()
             # The members know nothing of each other: each descends its own mean over the situations.
@@ -100,10 +100,10 @@ class MAML:
     def adapt(
         self, model: Dynamics, theta: Theta, h: Tensor, support: Batch, inner_loop: InnerLoop
     ) -> tuple[Theta, Tensor]:
-        """Returns theta~ = U^k(theta) as a function of theta, to be differentiated, and the loss before it, (B,)."""
+        """Returns theta~ = U^k(theta) as a function of theta, to be differentiated, and the loss before it, (B, P)."""
 
         def loss_of(theta: Theta) -> tuple[Tensor, Tensor]:
-            loss = model.loss(theta, h, support)
+            loss = model.loss(support, h, theta)
             return loss.sum(), loss.detach()
 
         losses = []
@@ -126,16 +126,13 @@ class MAML:
         for gradient in gradients:
             gradient.mul_(factor.view(-1, *[1] * (gradient.ndim - 1)))
 
-    def sample(self, data: Batch, c: Tensor, generator: torch.Generator) -> tuple[Batch, Batch]:
-        """Draws for each situation in ``c`` transitions for the inner steps, and others to judge them by."""
-        chance = torch.rand(len(c), data.x.shape[1], generator=generator, device=generator.device)
-        order = chance.argsort(dim=1).to(data.x.device)
-        support, query, _ = order.tensor_split([self.batch_size, self.batch_size + self.query_size], dim=1)
-        c = c[:, None]
-        return (
-            Batch(data.x[c, support], data.y[c, support], data.weight[c, support]),
-            Batch(data.x[c, query], data.y[c, query], data.weight[c, query]),
-        )
+    def sample(self, data: Batch, c: Tensor, members: int, generator: torch.Generator) -> tuple[Batch, Batch]:
+        """Draws for each situation in ``c`` and each member transitions for the inner steps, and others to judge by."""
+        shape = (len(c), members, data.x.shape[1])
+        order = torch.rand(shape, generator=generator, device=generator.device).argsort(dim=-1).to(data.x.device)
+        support, query = order[..., : self.batch_size], order[..., self.batch_size :][..., : self.query_size]
+        c = c[:, None, None]
+        return data[c, support], data[c, query]
 
     def _check(self, model: Dynamics, data: Batch, inner_loop: InnerLoop) -> None:
         if model.n_situations != 1:

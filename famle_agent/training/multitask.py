@@ -57,13 +57,12 @@ class JointTraining:
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimizer, lambda done: min(1.0, 2.0 * (1.0 - done / max(1, self.iterations)))
         )
-        theta, member = dict(model.theta.items()), torch.arange(model.members, device=data.x.device)[:, None]
         left = (progress or Progress()).iterations(
             self.iterations, generator, model=model, optimizer=optimizer, schedule=schedule
         )
         for _ in left:
             c, batch = self.sample(data, model.members, generator)
-            loss = model.loss(theta, model.embeddings[member, model.embedding_index(c)], batch)
+            loss = model.loss(batch, model.embeddings_by_row(c))
             optimizer.zero_grad()
             loss.sum().backward()  # type: ignore[no-untyped-call]
             optimizer.step()
@@ -71,9 +70,9 @@ class JointTraining:
             yield loss.detach().mean().item()
 
     def sample(self, data: Batch, members: int, generator: torch.Generator) -> tuple[torch.Tensor, Batch]:
-        """Draws a minibatch for each member, and the situations c (P, batch_size) that its transitions are from."""
+        """Draws a minibatch for each member, and the situations c (1, P, batch_size) that its transitions are from."""
         n_situations, n = data.weight.shape
-        shape, device = (members, self.batch_size), generator.device
+        shape, device = (1, members, self.batch_size), generator.device
         c = torch.randint(n_situations, shape, generator=generator, device=device).to(data.x.device)
         i = torch.randint(n, shape, generator=generator, device=device).to(data.x.device)
-        return c, Batch(data.x[c, i], data.y[c, i], data.weight[c, i])
+        return c, data[c, i]

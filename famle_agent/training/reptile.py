@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from famle_agent.models.dynamics import Batch, Dynamics, expand
+from famle_agent.models.dynamics import Batch, Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.training.progress import Progress
 
@@ -87,24 +87,23 @@ class Reptile:
             # Sample situations c and start from theta and h_c (line 10).
             order = torch.randperm(n_situations, generator=generator, device=generator.device)
             c = order[:meta_batch_size].to(data.x.device)
-            theta, h = model.parameters_by_name(), model.embeddings_of(c)
+            theta, h = model.theta_of(meta_batch_size), model.embeddings_of(c)
 
             # theta~, h~ = U^k(theta, h_c) (line 11).
-            sample = partial(self.sample, data, c.repeat_interleave(model.members), generator)
-            theta_tilde, h_tilde, losses = inner_loop(model, expand(theta, meta_batch_size), h, sample)
+            sample = partial(self.sample, data, c, model.members, generator)
+            theta_tilde, h_tilde, losses = inner_loop(model, theta, h, sample)
 
             # Move theta towards the mean of theta~ and each h_c towards its h~ (lines 12 and 13).
-            decay, members = 1.0 - iteration / self.iterations, model.members
+            decay = 1.0 - iteration / self.iterations
             for name, value in model.theta.items():
-                value.lerp_(theta_tilde[name].view(-1, *value.shape).mean(dim=0), decay * self.meta_lr)
+                value.lerp_(theta_tilde[name].mean(dim=0), decay * self.meta_lr)
             if not shared:
-                h = h.lerp(h_tilde, decay * self.embedding_meta_lr)
-                model.embeddings[:, c] = h.view(-1, members, h.shape[1]).transpose(0, 1)
+                model.embeddings[:, c] = h.lerp(h_tilde, decay * self.embedding_meta_lr).transpose(0, 1)
 
             yield MetaStep(iteration + 1, c, losses[0].mean().item(), losses[-1].mean().item())
 
-    def sample(self, data: Batch, c: Tensor, generator: torch.Generator) -> Batch:
-        """Draws a minibatch of each situation in ``c``, with repetitions."""
-        shape = (len(c), self.batch_size)
+    def sample(self, data: Batch, c: Tensor, members: int, generator: torch.Generator) -> Batch:
+        """Draws minibatches of each situation in ``c`` (B,) for each member, (B, P, batch_size), with repetitions."""
+        shape = (len(c), members, self.batch_size)
         i = torch.randint(data.x.shape[1], shape, generator=generator, device=generator.device).to(data.x.device)
-        return Batch(data.x[c[:, None], i], data.y[c[:, None], i], data.weight[c[:, None], i])
+        return data[c[:, None, None], i]

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from famle_agent.adaptation.memory import Memory, minibatches, whole_memory
-from famle_agent.adaptation.posterior import better_explained
 from famle_agent.models.dynamics import Batch, Dynamics
 
 CPU = torch.device("cpu")
@@ -132,7 +131,7 @@ def test_candidate_is_better_where_it_explains_what_counts_better(
     robots: int, size: int, candidates: int, seed: int
 ) -> None:
     seen, candidate = random_memory(robots, size, candidates, seed), torch.randint(candidates, (robots,))
-    better = better_explained(seen, candidate)
+    better = seen.better_explained(candidate)
     for robot in range(robots):
         counts = seen.weight[robot, -seen.own_log_p.shape[1] :] == 1
         theirs, own = seen.log_p[robot, counts, candidate[robot]].sum(), seen.own_log_p[robot, counts].sum()
@@ -143,7 +142,7 @@ def test_candidate_is_better_where_it_explains_what_counts_better(
 def test_what_explains_as_well_as_the_belief_is_not_better(robots: int, size: int, candidates: int, seed: int) -> None:
     seen, everyone = random_memory(robots, size, candidates, seed), torch.ones(robots, dtype=torch.bool)
     candidate = torch.randint(candidates, (robots,))
-    assert not better_explained(seen.begun_anew(everyone, size, candidate), candidate).any()
+    assert not seen.begun_anew(everyone, size, candidate).better_explained(candidate).any()
 
 
 @given(*sizes, st.integers(1, 9), st.integers(1, 9))
@@ -197,7 +196,7 @@ def model_of(members: int = 1) -> Dynamics:
 
 
 def numbers(batch: Batch) -> Tensor:
-    """Which transitions there are in a batch, (rows, n)."""
+    """Which transitions there are in a batch, (B, P, n) or (B, n)."""
     return batch.x[..., 0]
 
 
@@ -211,15 +210,15 @@ def test_minibatch_holds_what_counts_of_each_robot(
     memory = numbered(torch.tensor(robots, dtype=torch.float32))
     batch = minibatches(size, torch.Generator().manual_seed(seed))(model_of(members), memory)()
     drawn = numbers(batch)
-    assert drawn.shape == (len(robots) * members, size)
+    assert drawn.shape == (len(robots), members, size)
     assert (batch.y == 1.0).all()
-    for row in range(len(drawn)):
-        counted = memory.obs[row // members, memory.weight[row // members] == 1]
+    for robot in range(len(drawn)):
+        counted = memory.obs[robot, memory.weight[robot] == 1]
         if len(counted):
-            assert (batch.weight[row] == 1).all()
-            assert set(drawn[row].tolist()) <= set(counted.flatten().tolist())
+            assert (batch.weight[robot] == 1).all()
+            assert set(drawn[robot].flatten().tolist()) <= set(counted.flatten().tolist())
         else:
-            assert (batch.weight[row] == 0).all()  # nothing that could be learnt from
+            assert (batch.weight[robot] == 0).all()  # nothing that could be learnt from
 
 
 @given(weights)
@@ -227,7 +226,7 @@ def test_all_that_counts_is_drawn_as_often(robots: list[list[bool]]) -> None:
     memory = numbered(torch.tensor(robots, dtype=torch.float32))
     batch = minibatches(3000, torch.Generator().manual_seed(0))(model_of(), memory)()
     for row, weight in enumerate(memory.weight):
-        counts = torch.bincount(numbers(batch)[row].long() - 6 * row, minlength=6) * batch.weight[row].mean()
+        counts = torch.bincount(numbers(batch)[row, 0].long() - 6 * row, minlength=6) * batch.weight[row].mean()
         torch.testing.assert_close(counts, 3000 * weight / weight.sum().clamp(min=1), rtol=0.2, atol=0.0)
 
 
@@ -243,15 +242,15 @@ def test_rows_and_steps_draw_by_themselves() -> None:
     assert not torch.equal(one, other)
     assert torch.equal(numbers(again()), one)
     of_members = numbers(draws(members=2)())
-    assert not torch.equal(of_members[0], of_members[1])
+    assert not torch.equal(of_members[:, 0], of_members[:, 1])
 
 
-def test_whole_memory_is_what_each_member_sees_each_time() -> None:
+def test_whole_memory_is_what_all_members_see_each_time() -> None:
     memory = numbered(torch.tensor([[0.0, 1.0, 1.0], [1.0, 1.0, 1.0]]))
     draw = whole_memory(model_of(members=2), memory)
     batch = draw()
-    assert torch.equal(numbers(batch), memory.obs[[0, 0, 1, 1], :, 0])
-    assert torch.equal(batch.weight, memory.weight[[0, 0, 1, 1]])
+    assert torch.equal(numbers(batch), memory.obs[..., 0])
+    assert torch.equal(batch.weight, memory.weight)
     assert draw() is batch
 
 

@@ -13,7 +13,7 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from famle_agent import FAMLE, FAMLEWrapper, Transitions
-from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.belief import Candidates
 from tests.helpers import run, some_observations
 
 MakeEnv = Callable[..., gym.Env[Any, Any]]
@@ -167,17 +167,16 @@ def test_robots_of_an_ensemble_live_as_each_would_alone(ensemble: FAMLE, transit
             states[k] = replace(states[k], last=(torch.from_numpy(following), states[k].last[1]))
     together = states[0]
     assert together.belief.adaptations == 3
-    assert together.belief.h.shape[0] == 6
+    assert together.belief.h.shape[:2] == (3, 2)
     for robot in range(3):
         alone = states[1 + robot]
         torch.testing.assert_close(
             alone.belief.log_posterior[0], together.belief.log_posterior[robot], rtol=1e-3, atol=1e-2
         )
-        torch.testing.assert_close(alone.belief.h, together.belief.h[2 * robot : 2 * robot + 2], rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(alone.belief.h, together.belief.h[robot : robot + 1], rtol=1e-3, atol=1e-3)
         for name, value in alone.belief.theta.items():
-            torch.testing.assert_close(
-                value, together.belief.theta[name][2 * robot : 2 * robot + 2], rtol=1e-3, atol=1e-3
-            )
+            own = together.belief.theta[name][robot : robot + 1]
+            torch.testing.assert_close(value, own, rtol=1e-3, atol=1e-3)
 
 
 def test_ensemble_learns_on_several_robots(load: Callable[..., FAMLE]) -> None:
@@ -187,7 +186,7 @@ def test_ensemble_learns_on_several_robots(load: Callable[..., FAMLE]) -> None:
     agent.learn(15)
     assert agent.belief.posterior.shape == (3, N_CANDIDATES)
     assert agent.belief.adaptations == 2
-    assert agent.belief.h.shape == (6, 5)
+    assert agent.belief.h.shape == (3, 2, 5)
 
 
 # --- saving and loading -------------------------------------------------------------------------------------

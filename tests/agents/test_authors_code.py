@@ -11,8 +11,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -20,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from famle_agent import AMPC, FAMLE, FAMLEWrapper, OnlineState, Transitions
 from famle_agent.models.dynamics import Batch, Dynamics, Theta
 from famle_agent.models.gradient_steps import InnerLoop
-from famle_agent.planning import bounded
+from famle_agent.models.simulator import Simulator
 from famle_envs.reacher import ReacherEnv
 
 Load = Callable[..., FAMLE]
@@ -152,10 +150,10 @@ def test_first_episode_is_lived_with_what_was_meta_learned(load: Load, data: Tra
     for i in range(EPISODE):
         agent.observe(data.obs[3, i], data.action[3, i], data.next_obs[3, i])
         belief = agent.belief
-        assert torch.equal(belief.h, model.embeddings[:, 0])
-        assert all(torch.equal(value, model.theta[name]) for name, value in belief.theta.items())
+        assert torch.equal(belief.h[0], model.embeddings[:, 0])
+        assert all(torch.equal(value[0], model.theta[name]) for name, value in belief.theta.items())
     agent.begin_episode()
-    assert not torch.equal(agent.belief.theta["weight_0"], model.theta["weight_0"])
+    assert not torch.equal(agent.belief.theta["weight_0"][0], model.theta["weight_0"])
     assert model.embeddings[0, agent.belief.posterior.argmax()].sub(agent.belief.h).abs().max() < 0.2
 
 
@@ -168,9 +166,9 @@ def test_steps_are_passes_through_all_that_was_seen(load: Load, rules: list[Inne
 def test_each_step_sees_a_minibatch_of_the_memory(load: Load, monkeypatch: pytest.MonkeyPatch) -> None:
     sizes, loss = [], Dynamics.loss
 
-    def watched(self: Dynamics, theta: Theta, h: torch.Tensor, batch: Batch) -> torch.Tensor:
-        sizes.append((batch.weight.shape[1], batch.weight.min().item()))
-        return loss(self, theta, h, batch)
+    def watched(self: Dynamics, batch: Batch, h: torch.Tensor, theta: Theta) -> torch.Tensor:
+        sizes.append((batch.weight.shape[-1], batch.weight.min().item()))
+        return loss(self, batch, h, theta)
 
     monkeypatch.setattr(Dynamics, "loss", watched)
     counted(load(), "learn", episodes=3)
@@ -227,11 +225,11 @@ def test_only_the_robot_whose_episode_ended_adapts(load: Load, data: Transitions
     agent, other = load(robots=2), 1 - ended
     state = two_robots(agent, data, 5, {4: [robot == ended for robot in range(2)]})
     belief, model = state.belief, agent.model
-    assert torch.equal(belief.h[other], model.embeddings[0, 0])
-    assert not torch.equal(belief.h[ended], model.embeddings[0, 0])
+    assert torch.equal(belief.h[other, 0], model.embeddings[0, 0])
+    assert not torch.equal(belief.h[ended, 0], model.embeddings[0, 0])
     for name, value in belief.theta.items():
-        assert torch.equal(value[other], model.theta[name][0])
-        assert not torch.equal(value[ended], model.theta[name][0])
+        assert torch.equal(value[other], model.theta[name])
+        assert not torch.equal(value[ended], model.theta[name])
     assert state.memory.weight.sum(dim=1).tolist() == ([3, 4] if ended == 0 else [4, 3])
 
 
@@ -253,31 +251,20 @@ def test_robots_of_a_vec_env_learn_episode_by_episode(load: Load) -> None:
 @pytest.mark.parametrize("members", [1, 2])
 def test_predictions_are_bounded_from_the_first_adaptation_on(data: Transitions, members: int) -> None:
     agent = FAMLE(make_robot(), "original", seed=0, **TINY | {"members": members}).meta_learn(data)
-    far, action, two = torch.full((2 * members, 1, 12), 5.0), torch.zeros(2 * members, 1, 5), [0, 7]
+    far, action, two = torch.full((2, 1, 12), 5.0), torch.zeros(2, 1, 5), [0, 7]
     for i in range(EPISODE):
         agent.observe(data.obs[two, i], data.action[two, i], data.next_obs[two, i])
         state = agent.state_of(2)
-        free = agent.model.simulator(state.belief.theta, state.belief.h)(far, action)
+        free = Simulator(agent.model, state.belief.h, state.belief.theta)(far, action)
         assert torch.equal(agent.adapter.model_for(state.belief, state.memory)(far, action), free)
     agent.begin_episode()
     state = agent.state_of(2)
     seen = torch.from_numpy(np.concatenate([data.obs[two, :EPISODE], data.next_obs[two, :EPISODE]], axis=1))
     for sign in (-1.0, 1.0):
-        reached = agent.adapter.model_for(state.belief, state.memory)(sign * far, action).view(2, members, 12)
+        reached = agent.adapter.model_for(state.belief, state.memory)(sign * far, action)[:, :, 0]
         assert (reached >= seen.amin(dim=1, keepdim=True)).all()
         assert (reached <= seen.amax(dim=1, keepdim=True)).all()
     agent.get_env().close()
-
-
-@given(st.integers(1, 3), st.integers(1, 4), st.integers(0, 1000))
-def test_bounded_model_is_the_nearest_in_the_range(robots: int, n: int, seed: int) -> None:
-    torch.manual_seed(seed)
-    low, high = torch.sort(torch.randn(2, robots, 3), dim=0).values
-    obs, action = 3 * torch.randn(robots, n, 3), torch.randn(robots, n, 2)
-    limited = bounded(lambda s, a: s + a.sum(dim=-1, keepdim=True), low, high)(obs, action)
-    free = obs + action.sum(dim=-1, keepdim=True)
-    assert torch.equal(limited, torch.maximum(torch.minimum(free, high[:, None]), low[:, None]))
-    assert torch.equal(bounded(lambda s, a: s, low - math.inf, high + math.inf)(obs, action), obs)
 
 
 @pytest.fixture

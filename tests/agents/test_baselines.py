@@ -13,7 +13,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from famle_agent import AMPC, AMPCMAML, FAMLE, FAMLEWrapper, ModelBasedAgent, NotLearnedError, Transitions
-from famle_agent.models.dynamics import Batch, expand
+from famle_agent.models.dynamics import Batch
 from tests.helpers import run
 
 MakeEnv = Callable[..., gym.Env[Any, Any]]
@@ -111,7 +111,7 @@ def saved(agent: ModelBasedAgent) -> io.BytesIO:
 def theta_of(agent: ModelBasedAgent) -> torch.Tensor:
     """All parameters of what an agent believes, one row a robot and member."""
     belief = agent.belief
-    return torch.cat([value.flatten(1) for _, value in sorted(belief.theta.items())], dim=1)
+    return torch.cat([value.flatten(0, 1).flatten(1) for _, value in sorted(belief.theta.items())], dim=1)
 
 
 # --- the face of an agent ---------------------------------------------------------------------------------
@@ -231,7 +231,7 @@ def test_members_of_an_ensemble_adapt_and_plan_together(data: Transitions, make_
     assert agent.model.members == 3
     assert len(theta_of(agent)) == 3
     state = run(agent, env, steps=6)
-    assert len(state.belief.h) == 3
+    assert state.belief.h.shape[:2] == (1, 3)
     agent.learn(4)
     assert len({tuple(row) for row in theta_of(agent).tolist()}) == 3
     loaded = KINDS[kind][0].load(saved(agent), env=env, device="cpu")
@@ -269,7 +269,7 @@ def test_the_one_embedding_stays_as_it_is(load: Load, data: Transitions, kind: s
     embeddings = agent.model.embeddings
     assert embeddings.shape == (1, 1, 1)
     tell(agent, data, 4)
-    assert torch.equal(agent.belief.h, embeddings[:, 0])
+    assert torch.equal(agent.belief.h[0], embeddings[:, 0])
 
 
 def test_rival_that_knows_nothing_is_a_random_network_in_the_units_of_the_simulation(
@@ -277,8 +277,8 @@ def test_rival_that_knows_nothing_is_a_random_network_in_the_units_of_the_simula
 ) -> None:
     one, other = (make("ampc", make_env(), members=2).meta_learn(given).model for given in (data, unseen))
     obs, next_obs = torch.from_numpy(data.obs), torch.from_numpy(data.next_obs)
-    torch.testing.assert_close(one.input_mean, one.features(obs).mean(dim=(0, 1)), rtol=1e-4, atol=1e-5)
-    deviation = one.targets(obs, next_obs).flatten(0, 1).std(dim=0)
+    torch.testing.assert_close(one.input_mean, one.layout.features(obs).mean(dim=(0, 1)), rtol=1e-4, atol=1e-5)
+    deviation = one.layout.change(obs, next_obs).flatten(0, 1).std(dim=0)
     torch.testing.assert_close(one.target_std, deviation, rtol=1e-4, atol=1e-5)
     assert not torch.equal(one.target_std, other.target_std)
     for name, value in one.theta.items():
@@ -298,9 +298,9 @@ def test_meta_learning_prepares_for_the_steps_on_the_robot(load: Load, unseen: T
     for name in (kind, "ampc"):
         agent = load(name)
         model, support, query = agent.model, *(encoded(agent, unseen, half) for half in HALVES)
-        theta, h = expand(model.parameters_by_name(), 11), model.embeddings_of(torch.arange(11))
+        theta, h = model.theta_of(11), model.embeddings_of(torch.arange(11))
         theta, h, _ = rule(model, theta, h, lambda data=support: data)
-        losses.append(model.loss(theta, h, query).mean().item())
+        losses.append(model.loss(query, h, theta).mean().item())
     assert losses[0] < 0.7 * losses[1]
 
 
@@ -309,7 +309,7 @@ def test_rival_learns_on_the_robots_from_scratch(load: Load, data: Transitions) 
     later = encoded(agent, data, slice(45, 60))
     for i in range(45):
         agent.observe(data.obs[:, i], data.action[:, i], data.next_obs[:, i])
-        losses.append(agent.model.loss(agent.belief.theta, agent.belief.h, later).mean().item())
+        losses.append(agent.model.loss(later, agent.belief.h, agent.belief.theta).mean().item())
     assert losses[-1] < 0.75 * losses[0]
 
 

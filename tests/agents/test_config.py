@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import famle_agent
 from famle_agent import AMPC, FAMLE, Config
-from famle_agent.adaptation.adapters import Adaptation, Epochs, Filter, GradientSteps, Steps, Window
+from famle_agent.adaptation.settings import Adaptation, Epochs, Filter, GradientSteps, Steps, Window
 from famle_agent.agents.config import Rounds, Simulation
 from famle_agent.agents.presets import known_robots, robot_of
 from famle_agent.agents.world_model import ModelConfig
@@ -158,7 +158,6 @@ def test_adaptation_inherits_what_is_not_said_otherwise() -> None:
     assert inner_loop(config) == config.training.inner_loop
     own = inner_loop(settings(adapt_steps=3, adapt_lr=0.0, adapt_embedding_lr=0.5))
     assert (own.steps, own.lr, own.embedding_lr) == (3, 0.0, 0.5)
-    assert inner_loop(settings(adapt_decay=3.0)) == replace(inner_loop(Config()), decay=3.0)
     assert inner_loop(settings(inner_optimizer="sgd")).optimizer == "sgd"
     assert inner_loop(settings(inner_optimizer="sgd", adapt_optimizer="adam")).optimizer == "adam"
 

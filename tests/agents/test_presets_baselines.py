@@ -7,7 +7,7 @@ import gymnasium as gym
 import pytest
 
 from famle_agent import AMPC, AMPCMAML, FAMLE, Config
-from famle_agent.adaptation.adapters import Window
+from famle_agent.adaptation.settings import Window
 from famle_agent.agents.presets import known_robots
 
 RIVALS: dict[str, tuple[Any, dict[str, Any]]] = {

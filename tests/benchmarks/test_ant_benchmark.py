@@ -14,7 +14,7 @@ from benchmarks.reporting.looks import look
 from benchmarks.reporting.report import show
 from benchmarks.task import Task
 from famle_agent import ModelBasedAgent
-from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.belief import Candidates
 from famle_envs.ant import AntEnv
 from tests.helpers import simple_model
 

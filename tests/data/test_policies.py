@@ -14,6 +14,7 @@ from torch import Tensor
 
 from famle_agent.data.policies import HeldUniformPolicy, PlanningPolicy, make_held_uniform, make_planning
 from famle_agent.models.dynamics import Dynamics
+from famle_agent.models.simulator import Simulator
 from famle_agent.planning import ICEM, MPPI, RandomShooting
 from tests.clock import HIGH, LOW, Clock
 
@@ -166,9 +167,9 @@ def test_planned_action_lies_in_the_action_space(low: float, high: float) -> Non
     ends = torch.tensor([[[1.0, -1.0]] * 2])
     planner: Any = SimpleNamespace(horizon=2, plan=lambda judge, plan, generator: (ends[:, 0], ends))
     chance = torch.Generator()
-    policy = PlanningPolicy(
-        lambda obs, action: obs, 1, lambda obs, action, next_obs: obs[..., 0], planner, space, chance
-    )
+    model = plane_model()
+    simulator = Simulator(model, model.embeddings_of(torch.tensor([0])))
+    policy = PlanningPolicy(simulator, lambda obs, action, next_obs: obs[..., 0], planner, space, chance)
     action = policy(np.zeros(2, dtype=np.float32), True)
     assert space.contains(action)
     np.testing.assert_allclose(action, [high, low], rtol=1e-6)

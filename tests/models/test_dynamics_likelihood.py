@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from famle_agent.models.dynamics import Batch, Dynamics
+from famle_agent.models.members import with_members
 from tests.helpers import models, random_h, random_theta, random_transitions, simple_model
 
 every_likelihood = pytest.mark.parametrize("degrees_of_freedom", [0.0, 3.0])
@@ -18,26 +19,18 @@ def training_batch(model: Dynamics, n: int) -> Batch:
     return model.encode(*random_transitions(model, model.n_situations, n))
 
 
-def of_all_situations(model: Dynamics, data: Batch) -> tuple[Tensor, Batch]:
-    """Embeddings and data of the N situations in the layout of Reptile, index = situation * P + member."""
-    h = model.embeddings_of(torch.arange(model.n_situations))
-    return h, Batch(*(values.repeat_interleave(model.members, dim=0) for values in (data.x, data.y, data.weight)))
-
-
 def log_likelihood_per_member(model: Dynamics, data: Batch) -> Tensor:
     """Of all transitions together, (P,)."""
-    h, rows = of_all_situations(model, data)
-    theta = {name: value.repeat(model.n_situations, *[1] * (value.ndim - 1)) for name, value in model.theta.items()}
-    density = model.log_likelihood({name: value.detach() for name, value in theta.items()}, h, rows)
-    return density.sum(dim=1).view(model.n_situations, model.members).sum(dim=0)
+    alone = [with_members(model, 1, member) for member in range(model.members)]
+    c = torch.arange(model.n_situations)
+    return torch.stack([one.log_likelihood(data, one.embeddings_of(c)).sum() for one in alone])
 
 
 def exact_batch(model: Dynamics, n: int) -> Batch:
     """Targets that the model, of one member, predicts without an error."""
     x, N = torch.randn(model.n_situations, n, model.n_features + model.action_dim), model.n_situations
-    h = model.embeddings.detach().repeat_interleave(n, dim=1)
-    y = model.predict(model.parameters_by_name(), h, x.flatten(0, 1)[None])
-    return Batch(x, y.view(N, n, -1), torch.ones(N, n))
+    y = model(x, model.embeddings_of(torch.arange(N)), model.theta_of(N))[:, 0]
+    return Batch(x, y, torch.ones(N, n))
 
 
 # --- the loss ---------------------------------------------------------------------------------------------
@@ -45,41 +38,38 @@ def exact_batch(model: Dynamics, n: int) -> Batch:
 
 def test_loss_is_half_the_mean_squared_error() -> None:
     model = simple_model()
-    theta, h = model.parameters_by_name(), model.embeddings[:, 0]
-    data = model.encode(*random_transitions(model, 1, 9))
-    error = model.forward(model.network(theta, h), data.x) - data.y
-    torch.testing.assert_close(model.loss(theta, h, data), 0.5 * error.square().mean()[None])
+    h, data = model.embeddings_of(torch.tensor([0])), model.encode(*random_transitions(model, 1, 9))
+    error = model(data.x, h)[:, 0] - data.y
+    torch.testing.assert_close(model.loss(data, h), 0.5 * error.square().mean()[None, None])
 
 
 def test_loss_with_an_embedding_for_each_transition() -> None:
     model = simple_model(members=2)
-    theta, data = model.parameters_by_name(), model.encode(*random_transitions(model, 2, 8))
-    c = torch.randint(4, (2, 8))
-    h = model.embeddings.detach()[torch.arange(2)[:, None], c]
+    data, h = model.encode(*random_transitions(model, 1, 8)), model.embeddings_by_row(torch.randint(4, (1, 2, 8)))
     each = [
-        model.loss(theta, h[:, i], Batch(data.x[:, i : i + 1], data.y[:, i : i + 1], data.weight[:, i : i + 1]))
+        model.loss(Batch(data.x[:, i : i + 1], data.y[:, i : i + 1], data.weight[:, i : i + 1]), h[:, :, i])
         for i in range(8)
     ]
-    torch.testing.assert_close(model.loss(theta, h, data), torch.stack(each).mean(dim=0))
+    torch.testing.assert_close(model.loss(data, h), torch.stack(each).mean(dim=0))
 
 
 @given(models(), st.integers(1, 5), st.integers(1, 5))
 def test_padding_changes_nothing(model: Dynamics, n: int, padding: int) -> None:
-    theta, h, size = random_theta(model, 2), random_h(model, 2), 2 * model.members
-    real, noise = random_transitions(model, size, n), random_transitions(model, size, padding)
-    weight = torch.cat([torch.ones(size, n), torch.zeros(size, padding)], dim=1)
+    theta, h = random_theta(model, 2), random_h(model, 2)
+    real, noise = random_transitions(model, 2, n), random_transitions(model, 2, padding)
+    weight = torch.cat([torch.ones(2, n), torch.zeros(2, padding)], dim=1)
     padded = model.encode(*(torch.cat([a, b], dim=1) for a, b in zip(real, noise, strict=True)), weight)
     data = model.encode(*real)
-    torch.testing.assert_close(model.loss(theta, h, padded), model.loss(theta, h, data))
-    density = model.log_likelihood(theta, h, padded)
-    torch.testing.assert_close(density[:, :n], model.log_likelihood(theta, h, data))
+    torch.testing.assert_close(model.loss(padded, h, theta), model.loss(data, h, theta))
+    density = model.log_likelihood(padded, h, theta)
+    torch.testing.assert_close(density[:, :n], model.log_likelihood(data, h, theta))
     assert (density[:, n:] == 0).all()
 
 
 def test_nothing_but_padding_has_no_loss() -> None:
     model = simple_model()
     data = model.encode(*random_transitions(model, 1, 3), torch.zeros(1, 3))
-    assert model.loss(model.parameters_by_name(), model.embeddings[:, 0], data).item() == 0
+    assert model.loss(data, model.embeddings_of(torch.tensor([0]))).item() == 0
 
 
 # --- the likelihood ---------------------------------------------------------------------------------------
@@ -87,21 +77,21 @@ def test_nothing_but_padding_has_no_loss() -> None:
 
 @given(models(), st.integers(1, 4))
 def test_log_likelihood_is_that_of_its_distribution(model: Dynamics, n: int) -> None:
-    theta, h, size = random_theta(model, 2), random_h(model, 2), 2 * model.members
-    data = model.encode(*random_transitions(model, size, n))
-    mean = model.forward(model.network(theta, h), data.x)
-    noise = torch.stack([model.noise_std[row % model.members] for row in range(size)])[:, None]
+    """A mean over the members of each one's, with the noise of each."""
+    theta, h = random_theta(model, 2), random_h(model, 2)
+    data = model.encode(*random_transitions(model, 2, n))
+    mean, noise = model(data.x, h, theta), model.noise_std[:, None]
     nu = model.degrees_of_freedom
     shape = torch.distributions.StudentT(nu, mean, noise) if nu else torch.distributions.Normal(mean, noise)
-    expected = shape.log_prob(data.y).sum(dim=-1)
-    torch.testing.assert_close(model.log_likelihood(theta, h, data), expected, rtol=1e-4, atol=1e-3)
+    expected = shape.log_prob(data.y[:, None]).sum(dim=-1).mean(dim=1)
+    torch.testing.assert_close(model.log_likelihood(data, h, theta), expected, rtol=1e-4, atol=1e-3)
 
 
 def densities_of(model: Dynamics, y: Tensor) -> Tensor:
     """Log-density at targets of one dimension."""
     x = torch.zeros(1, len(y), model.n_features + model.action_dim, dtype=y.dtype)
     data = Batch(x, y[None, :, None], torch.ones(1, len(y), dtype=y.dtype))
-    return model.log_likelihood(model.parameters_by_name(), model.embeddings.detach()[:, 0], data)[0]
+    return model.log_likelihood(data, model.embeddings_of(torch.tensor([0])), model.theta_of(1))[0]
 
 
 @pytest.mark.parametrize("degrees_of_freedom", [0.0, 0.7, 2.0, 3.0, 30.0])

@@ -5,8 +5,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from famle_agent.models.dynamics import Batch, Dynamics, Theta, expand
-from famle_agent.models.gradient_steps import Anchor, InnerLoop
+from famle_agent.models.dynamics import Batch, Dynamics, Theta
+from famle_agent.models.gradient_steps import InnerLoop
+from famle_agent.models.members import with_members
 
 OPTIMIZERS = ("sgd", "adam")
 
@@ -23,7 +24,7 @@ def some_data(size: int, seed: int = 0) -> Batch:
 
 
 def start(model: Dynamics, size: int) -> tuple[Theta, torch.Tensor]:
-    return expand(model.parameters_by_name(), size), model.embeddings_of(torch.arange(size))
+    return model.theta_of(size), model.embeddings_of(torch.arange(size))
 
 
 @given(st.integers(0, 4), st.floats(0.0, 0.1), st.floats(0.0, 0.5))
@@ -35,15 +36,15 @@ def test_steps_are_those_of_gradient_descent(steps: int, lr: float, embedding_lr
     for step in range(steps):
         leaves = {name: value.clone().requires_grad_() for name, value in theta_hand.items()}
         h_leaf = h_hand.clone().requires_grad_()
-        error = model.forward(model.network(leaves, h_leaf), data.x) - data.y
+        error = model(data.x, h_leaf, leaves)[:, 0] - data.y
         loss = 0.5 * error.square().mean()
         gradients = torch.autograd.grad(loss, [*leaves.values(), h_leaf])
         theta_hand = {
             name: value - lr * gradient for (name, value), gradient in zip(theta_hand.items(), gradients, strict=False)
         }
         h_hand = h_hand - embedding_lr * gradients[-1]
-        torch.testing.assert_close(losses[step, 0], loss.detach())
-    assert losses.shape == (steps, 1)
+        torch.testing.assert_close(losses[step, 0, 0], loss.detach())
+    assert losses.shape == (steps, 1, 1)
     torch.testing.assert_close(h, h_hand)
     for name, value in theta_hand.items():
         torch.testing.assert_close(theta[name], value)
@@ -57,7 +58,7 @@ def test_situations_do_not_influence_each_other(optimizer: str) -> None:
     for i in range(3):
         row = slice(i, i + 1)
         alone = Batch(data.x[row], data.y[row], data.weight[row])
-        one, h_one, loss = loop(model, model.parameters_by_name(), model.embeddings[0, row], lambda b=alone: b)
+        one, h_one, loss = loop(model, model.theta_of(1), model.embeddings_of(torch.tensor([i])), lambda b=alone: b)
         torch.testing.assert_close(h[row], h_one)
         torch.testing.assert_close(losses[:, row], loss)
         for name, value in one.items():
@@ -102,46 +103,11 @@ def test_each_step_draws_its_data() -> None:
         drawn.append(some_data(1, seed=len(drawn)))
         return drawn[-1]
 
-    _, _, losses = InnerLoop(3, 0.0, 0.0)(model, *start(model, 1), sample)
+    theta, h = start(model, 1)
+    _, _, losses = InnerLoop(3, 0.0, 0.0)(model, theta, h, sample)
     assert len(drawn) == 3
     for loss, data in zip(losses, drawn, strict=True):
-        torch.testing.assert_close(loss, model.loss(*start(model, 1), data))
-
-
-@given(st.floats(0.0, 20.0), st.lists(st.integers(0, 30), min_size=2, max_size=2))
-def test_anchor_takes_a_step_back_by_a_part_of_the_way(decay: float, seen: list[int]) -> None:
-    model, data = fresh_model(), some_data(2)
-    theta, h = start(model, 2)
-    anchor = Anchor({name: value + 1.0 for name, value in theta.items()}, torch.tensor(seen))
-    free, h_free, _ = InnerLoop(1, 0.1, 0.2)(model, theta, h, lambda: data)
-    drawn, h_drawn, _ = InnerLoop(1, 0.1, 0.2, decay=decay)(model, theta, h, lambda: data, anchor)
-    assert torch.equal(h_drawn, h_free)
-    for i, n in enumerate(seen):
-        part = min(1.0, decay / max(n, 1))
-        for name, value in free.items():
-            torch.testing.assert_close(drawn[name][i], (1.0 - part) * value[i] + part * anchor.theta[name][i])
-
-
-@pytest.mark.parametrize("optimizer", OPTIMIZERS)
-def test_anchor_holds_the_more_the_less_was_seen(optimizer: str) -> None:
-    model, data = fresh_model(), some_data(1)
-    data = Batch(*(values.expand(4, *values.shape[1:]) for values in (data.x, data.y, data.weight)))
-    theta, h = start(model, 1)
-    theta, h = {name: value.expand(4, *value.shape[1:]) for name, value in theta.items()}, h.expand(4, -1)
-    anchor = Anchor(theta, torch.tensor([1.0, 10.0, 100.0, 1e9]))
-    far, *_ = InnerLoop(50, 0.01, 0.0, optimizer, decay=1.0)(model, theta, h, lambda: data, anchor)
-    way = sum((value - theta[name]).flatten(1).square().sum(dim=1) for name, value in far.items())
-    assert way[0] == 0.0
-    assert (way.diff() > 0.0).all()
-    free, *_ = InnerLoop(50, 0.01, 0.0, optimizer)(model, theta, h, lambda: data)
-    for name, value in free.items():
-        torch.testing.assert_close(far[name][3], value[3], rtol=1e-3, atol=1e-4)
-
-
-def test_a_decay_without_an_anchor_is_refused() -> None:
-    model, data = fresh_model(), some_data(1)
-    with pytest.raises(ValueError, match="give an anchor"):
-        InnerLoop(1, 0.1, 0.1, decay=1.0)(model, *start(model, 1), lambda: data)
+        torch.testing.assert_close(loss, model.loss(data, h, theta))
 
 
 def test_gradients_are_found_where_they_are_switched_off() -> None:
@@ -154,15 +120,15 @@ def test_gradients_are_found_where_they_are_switched_off() -> None:
 @pytest.mark.parametrize("optimizer", OPTIMIZERS)
 def test_members_of_an_ensemble_do_not_influence_each_other(optimizer: str) -> None:
     torch.manual_seed(0)
-    model, data = Dynamics(2, 1, n_situations=3, embedding_dim=2, hidden=(6,), members=2), some_data(6)
-    loop, c = InnerLoop(5, 0.05, 0.2, optimizer), torch.arange(3)
-    theta, h, losses = loop(model, expand(model.parameters_by_name(), 3), model.embeddings_of(c), lambda: data)
+    model = Dynamics(2, 1, n_situations=3, embedding_dim=2, hidden=(6,), members=2)
+    data = Batch(*(values.unflatten(0, (3, 2)) for values in vars(some_data(6)).values()))  # each its own
+    loop, h = InnerLoop(5, 0.05, 0.2, optimizer), model.embeddings_of(torch.arange(3))
+    theta, h_tilde, losses = loop(model, model.theta_of(3), h, lambda: data)
     for member in range(2):
-        alone = Dynamics(2, 1, n_situations=3, embedding_dim=2, hidden=(6,))
-        own = {name: value[member : member + 1] for name, value in model.parameters_by_name().items()}
-        batch = Batch(data.x[member::2], data.y[member::2], data.weight[member::2])
-        one, h_one, loss = loop(alone, expand(own, 3), model.embeddings[member], lambda b=batch: b)
-        torch.testing.assert_close(h[member::2], h_one)
-        torch.testing.assert_close(losses[:, member::2], loss)
+        alone = with_members(model, 1, member)
+        batch = Batch(*(values[:, member] for values in vars(data).values()))
+        one, h_one, loss = loop(alone, alone.theta_of(3), h[:, [member]], lambda b=batch: b)
+        torch.testing.assert_close(h_tilde[:, [member]], h_one)
+        torch.testing.assert_close(losses[..., [member]], loss)
         for name, value in one.items():
-            torch.testing.assert_close(theta[name][member::2], value)
+            torch.testing.assert_close(theta[name][:, [member]], value)

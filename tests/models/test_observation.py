@@ -16,7 +16,7 @@ from famle_agent import FAMLE
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.observation import DIMS, ObservationLayout
 from famle_agent.models.reward import LearnedReward
-from tests.helpers import layouts, models, random_h, random_theta, simple_model
+from tests.helpers import layouts, models, random_h, simple_model
 
 seeds = st.integers(0, 1000)
 lengths, turns = st.floats(-100.0, 100.0), st.floats(-7.0, 7.0)
@@ -81,17 +81,6 @@ def test_robot_looks_the_same_to_a_model_wherever_it_stands(
     torch.testing.assert_close(layout.features(moved(layout, obs, way, turn)), layout.features(obs))
 
 
-@given(layouts(), seeds, st.integers(1, 3), st.integers(1, 4))
-def test_weights_for_inputs_do_to_inputs_what_the_weights_do_to_features(
-    layout: ObservationLayout, seed: int, size: int, out: int
-) -> None:
-    obs = observations(layout, 5, seed).expand(size, -1, -1)
-    torch.manual_seed(seed)
-    weight = torch.randn(size, layout.n_features, out, dtype=torch.float64)
-    folded = layout.weights_for_inputs(weight)
-    torch.testing.assert_close(torch.cat(layout.inputs(obs), dim=-1) @ folded, layout.features(obs) @ weight, **EXACT)
-
-
 # --- What a model predicts ---
 
 
@@ -144,7 +133,6 @@ def test_what_has_changed_leads_to_the_next_observation(layout: ObservationLayou
 def test_observations_are_not_touched(layout: ObservationLayout, seed: int) -> None:
     obs, next_obs = observations(layout, 4, seed), observations(layout, 4, seed + 1)
     layout.advance(obs, layout.change(obs, next_obs))
-    layout.inputs(obs)
     layout.features(obs)
     assert torch.equal(obs, observations(layout, 4, seed))
     assert torch.equal(next_obs, observations(layout, 4, seed + 1))
@@ -163,12 +151,10 @@ def test_heading_that_is_predicted_has_length_one() -> None:
 def test_model_predicts_the_same_motion_wherever_the_robot_stands(
     model: Dynamics, seed: int, way: tuple[float, float], turn: float
 ) -> None:
-    model, layout, rows = model.double(), model.layout, 2 * model.members
-    theta, h = {name: value.double() for name, value in random_theta(model, 2).items()}, random_h(model, 2).double()
-    simulator = model.simulator(theta, h)
-    obs = observations(layout, rows * 3, seed).reshape(rows, 3, -1)
-    action = torch.rand(rows, 3, model.action_dim, dtype=torch.float64)
-    here, there = simulator(obs, action), simulator(moved(layout, obs, way, turn), action)
+    model, layout, h = model.double(), model.layout, random_h(model, 2).double()
+    obs = observations(layout, 6, seed).reshape(2, 3, -1)
+    action = torch.rand(2, 3, model.action_dim, dtype=torch.float64)
+    here, there = (model.predict(each, action, h).detach() for each in (obs, moved(layout, obs, way, turn)))
     torch.testing.assert_close(there, moved(layout, here, way, turn), rtol=1e-7, atol=1e-7)
 
 
@@ -227,7 +213,7 @@ def test_yaw_is_an_angle_to_the_model_of_the_paper_too() -> None:
     agent = FAMLE("FamleMinitaur-v0", "paper", device="cpu")
     agent.get_env().close()
     obs, next_obs = (torch.tensor([0.0, 0.0, 0.2, 0.0, 0.0, yaw]) for yaw in (math.pi - 0.05, -math.pi + 0.05))
-    assert agent.policy.builder.dynamics(1).targets(obs, next_obs)[5].item() == pytest.approx(0.1, abs=1e-5)
+    assert agent.policy.builder.robot.layout.change(obs, next_obs)[5].item() == pytest.approx(0.1, abs=1e-5)
 
 
 @pytest.mark.parametrize(

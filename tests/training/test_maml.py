@@ -6,8 +6,9 @@ from itertools import islice
 import pytest
 import torch
 
-from famle_agent.models.dynamics import Batch, Dynamics, Theta, expand
+from famle_agent.models.dynamics import Batch, Dynamics, Theta
 from famle_agent.models.gradient_steps import InnerLoop
+from famle_agent.models.members import with_members
 from famle_agent.training.maml import MAML
 
 INNER_LOOP = InnerLoop(steps=2, lr=0.1, embedding_lr=0.0)
@@ -38,9 +39,9 @@ def loss_after_adaptation(model: Dynamics, seed: int) -> float:
     support, query = (
         Batch(data.x[:, part], data.y[:, part], data.weight[:, part]) for part in (slice(5), slice(5, 20))
     )
-    theta, h = expand(model.parameters_by_name(), 100), model.embeddings_of(torch.zeros(100, dtype=torch.long))
+    theta, h = model.theta_of(100), model.embeddings_of(torch.zeros(100, dtype=torch.long))
     theta, h, _ = INNER_LOOP(model, theta, h, lambda: support)
-    return model.loss(theta, h, query).mean().item()
+    return model.loss(query, h, theta).mean().item()
 
 
 def difference(one: Theta, other: Theta) -> float:
@@ -54,13 +55,13 @@ def test_unseen_situations_are_fitted_better_after_meta_learning(first_order: bo
 
 
 def test_same_seed_same_parameters() -> None:
-    one, same, other = (meta_learn(SETTINGS, seed).parameters_by_name() for seed in (0, 0, 1))
+    one, same, other = (meta_learn(SETTINGS, seed).theta_of(1) for seed in (0, 0, 1))
     assert difference(one, same) == 0
     assert difference(one, other) > 1e-3
 
 
 def test_order_of_the_gradient_matters() -> None:
-    second, first = (meta_learn(replace(SETTINGS, first_order=flag)).parameters_by_name() for flag in (False, True))
+    second, first = (meta_learn(replace(SETTINGS, first_order=flag)).theta_of(1) for flag in (False, True))
     assert difference(second, first) > 1e-3
 
 
@@ -72,8 +73,9 @@ def test_gradient_is_that_of_the_adapted_loss() -> None:
     h = model.embeddings_of(torch.zeros(4, dtype=torch.long))
 
     def adapted_loss(maml: MAML, theta: Theta) -> torch.Tensor:
-        theta_tilde, _ = maml.adapt(model, expand(theta, 4), h, support, INNER_LOOP)
-        return model.loss(theta_tilde, h, query).mean()
+        of_situations = {name: value.expand(4, *value.shape) for name, value in theta.items()}
+        theta_tilde, _ = maml.adapt(model, of_situations, h, support, INNER_LOOP)
+        return model.loss(query, h, theta_tilde).mean()
 
     def slope(maml: MAML) -> float:
         gradients = torch.autograd.grad(adapted_loss(maml, dict(model.theta.items())), list(model.theta.values()))
@@ -81,7 +83,7 @@ def test_gradient_is_that_of_the_adapted_loss() -> None:
             (gradient * direction[name]).sum().item() for name, gradient in zip(model.theta, gradients, strict=True)
         )
 
-    direction = {name: torch.randn_like(value) for name, value in model.parameters_by_name().items()}
+    direction = {name: torch.randn_like(value) for name, value in model.theta.items()}
     ahead, behind = (
         adapted_loss(SETTINGS, {name: value + step * direction[name] for name, value in model.theta.items()}).item()
         for step in (1e-5, -1e-5)
@@ -96,10 +98,11 @@ def test_inner_steps_and_their_judgement_see_different_transitions_of_the_same_s
     serial = torch.arange(n * points, dtype=torch.float32).view(n, points, 1)
     data = Batch(serial, serial, torch.ones(n, points))
     c = torch.tensor([4, 1, 3])
-    support, query = SETTINGS.sample(data, c, torch.Generator().manual_seed(0))
+    support, query = SETTINGS.sample(data, c, 2, torch.Generator().manual_seed(0))
     for row, situation in enumerate(c.tolist()):
-        seen = torch.cat([support.x[row], query.x[row]]).flatten()
-        assert sorted(seen.tolist()) == serial[situation].flatten().tolist()
+        for member in range(2):
+            seen = torch.cat([support.x[row, member], query.x[row, member]]).flatten()
+            assert sorted(seen.tolist()) == serial[situation].flatten().tolist()
 
 
 def test_embedding_stays_and_whoever_has_enough_stops() -> None:
@@ -137,7 +140,7 @@ def test_each_member_descends_the_gradient_that_it_would_have_alone(first_order:
     data = Batch(*(value[:, :1].expand_as(value).double() for value in (data.x, data.y, data.weight)))
     still = replace(SETTINGS, iterations=1, meta_lr=0.0, max_grad_norm=1e9, first_order=first_order)
     ensemble = fresh_model(members=3).double()
-    for model in (ensemble, *(alone := [ensemble.with_members(1, member) for member in range(3)])):
+    for model in (ensemble, *(alone := [with_members(ensemble, 1, member) for member in range(3)])):
         list(still.steps(model, data, INNER_LOOP, torch.Generator()))
     for member in range(3):
         for name, value in ensemble.theta.items():
@@ -164,7 +167,7 @@ def test_members_of_an_ensemble_are_as_good_as_one_network() -> None:
     list(SETTINGS.steps(model, data, INNER_LOOP, torch.Generator().manual_seed(0)))
     alone = loss_after_adaptation(meta_learn(SETTINGS), seed=2)
     for member in range(3):
-        after, start = (loss_after_adaptation(one.with_members(1, member), seed=2) for one in (model, before))
+        after, start = (loss_after_adaptation(with_members(one, 1, member), seed=2) for one in (model, before))
         assert after < 0.8 * start
         assert after < 1.3 * alone
     for name, value in model.theta.items():

@@ -5,7 +5,7 @@ from itertools import islice
 import pytest
 import torch
 
-from famle_agent.models.dynamics import Batch, Dynamics, expand
+from famle_agent.models.dynamics import Batch, Dynamics
 from famle_agent.training.multitask import JointTraining
 
 TRAINING = JointTraining(iterations=400, lr=0.01, embedding_lr=0.03, batch_size=64)
@@ -32,9 +32,7 @@ def trained(training: JointTraining = TRAINING, seed: int = 0, members: int = 1,
 
 def losses(model: Dynamics, c: list[int]) -> torch.Tensor:
     """The loss of each situation's data with the embedding of another, (N, P)."""
-    data, P = situations(), model.members
-    rows = Batch(*(values.repeat_interleave(P, dim=0) for values in (data.x, data.y, data.weight)))
-    return model.loss(expand(model.parameters_by_name(), 4), model.embeddings_of(torch.tensor(c)), rows).view(4, P)
+    return model.loss(situations(), model.embeddings_of(torch.tensor(c)))
 
 
 @pytest.mark.parametrize("gate", [True, False])
@@ -108,11 +106,11 @@ def test_minibatch_is_drawn_from_all_situations_and_differs_between_members() ->
     serial = torch.arange(4 * 50, dtype=torch.float32).view(4, 50, 1)
     data = Batch(serial, -serial, torch.ones(4, 50))
     c, batch = TRAINING.sample(data, 3, torch.Generator().manual_seed(0))
-    assert c.shape == (3, 64)
+    assert c.shape == (1, 3, 64)
     assert set(c.flatten().tolist()) == {0, 1, 2, 3}
     assert torch.equal(batch.x[..., 0] // 50, c.float())  # the transitions are of these situations
     assert torch.equal(batch.y, -batch.x)
-    assert len({tuple(row) for row in batch.x[..., 0].tolist()}) == 3
+    assert len({tuple(row) for row in batch.x[0, ..., 0].tolist()}) == 3
 
 
 def test_members_that_begin_alike_part_ways() -> None:

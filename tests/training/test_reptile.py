@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from famle_agent import AMPCMAML, NotLearnedError
-from famle_agent.models.dynamics import Batch, Dynamics, expand
+from famle_agent.models.dynamics import Batch, Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.training.maml import MAML
 from famle_agent.training.multitask import JointTraining
@@ -46,23 +46,19 @@ def test_one_iteration_is_algorithm_1(meta_batch_size: int, members: int) -> Non
     generator = torch.Generator().manual_seed(5)
     assert torch.equal(c, torch.randperm(4, generator=generator)[:meta_batch_size])
 
-    rows = c.repeat_interleave(members)
-
     def sample() -> Batch:
-        i = torch.randint(60, (len(rows), 8), generator=generator)
-        return Batch(*(values[rows[:, None], i] for values in (data.x, data.y, data.weight)))
+        i = torch.randint(60, (len(c), members, 8), generator=generator)
+        return data[c[:, None, None], i]
 
-    theta = before.parameters_by_name()
-    h = torch.stack([before.embeddings[member, situation] for situation in c for member in range(members)])
-    theta_tilde, h_tilde, losses = INNER_LOOP(before, expand(theta, meta_batch_size), h, sample)
+    theta, h = before.theta_of(meta_batch_size), before.embeddings[:, c].transpose(0, 1)
+    theta_tilde, h_tilde, losses = INNER_LOOP(before, theta, h, sample)
     h_meta = h + 0.7 * (h_tilde - h)
     others = [i for i in range(4) if i not in c]
     for member in range(members):
-        own = slice(member, None, members)  # the rows of this member
-        for name, value in model.parameters_by_name().items():
-            mean = theta_tilde[name][own].mean(dim=0)
-            torch.testing.assert_close(value[member], theta[name][member] + 0.3 * (mean - theta[name][member]))
-        torch.testing.assert_close(model.embeddings[member, c], h_meta[own])
+        for name, value in model.theta.items():
+            start, mean = before.theta[name][member], theta_tilde[name][:, member].mean(dim=0)
+            torch.testing.assert_close(value[member], start + 0.3 * (mean - start))
+        torch.testing.assert_close(model.embeddings[member, c], h_meta[:, member])
         assert torch.equal(model.embeddings[member, others], before.embeddings[member, others])
     assert steps[0].loss_before == losses[0].mean().item()
     assert steps[0].loss_after == losses[-1].mean().item()
@@ -73,9 +69,8 @@ def test_meta_learning_lowers_the_loss_of_every_situation() -> None:
     model, steps = meta_learn(reptile)
     assert [step.iteration for step in steps] == list(range(1, 301))
     assert steps[-1].loss_after < 0.1 * steps[0].loss_before
-    theta, c = expand(model.parameters_by_name(), 4), torch.arange(4)
-    own = model.loss(theta, model.embeddings_of(c), situations())
-    others = model.loss(theta, model.embeddings_of(c.roll(1)), situations())
+    c = torch.arange(4)
+    own, others = (model.loss(situations(), model.embeddings_of(each)) for each in (c, c.roll(1)))
     assert (own < 0.5 * others).all()  # each embedding stands for its own situation
 
 
@@ -114,9 +109,7 @@ def test_members_of_an_ensemble_learn_by_themselves() -> None:
     reptile = Reptile(iterations=100, meta_lr=1.0, embedding_meta_lr=1.0, meta_batch_size=4, batch_size=16)
     model, steps = meta_learn(reptile, members=2)
     assert steps[-1].loss_after < 0.3 * steps[0].loss_before
-    data, c = situations(), torch.arange(4)
-    both = Batch(*(values.repeat_interleave(2, dim=0) for values in (data.x, data.y, data.weight)))
-    loss = model.loss(expand(model.parameters_by_name(), 4), model.embeddings_of(c), both).view(4, 2)
+    loss = model.loss(situations(), model.embeddings_of(torch.arange(4)))  # (N, P)
     assert loss.mean(dim=0).max() < 2 * loss.mean(dim=0).min()
     for value in (*model.theta.values(), model.embeddings):
         assert not torch.equal(value[0], value[1])
@@ -166,10 +159,7 @@ every_learner = pytest.mark.parametrize("learn", [follow_reptile, follow_maml, t
 
 def losses(model: Dynamics, data: Batch) -> torch.Tensor:
     """The loss of each situation's data in each member, (N, P)."""
-    N, P = len(data.x), model.members
-    rows = Batch(*(values.repeat_interleave(P, dim=0) for values in (data.x, data.y, data.weight)))
-    theta, h = expand(model.parameters_by_name(), N), model.embeddings_of(torch.arange(N))
-    return model.loss(theta, h, rows).view(N, P)
+    return model.loss(data, model.embeddings_of(torch.arange(len(data.x))))
 
 
 @every_learner
@@ -186,23 +176,20 @@ def test_one_embedding_stays_and_the_network_learns_all_situations(
 def test_reptile_with_one_embedding_moves_towards_the_mean_of_the_adapted_networks() -> None:
     """Nichol et al., 2018: theta += alpha_meta mean(theta~ - theta)."""
     model, data = fresh_model(1, 1), situations()
-    theta, h = model.parameters_by_name(), model.embeddings_of(torch.arange(4))
-    theta = {name: value.clone() for name, value in theta.items()}
+    theta = {name: value.detach().clone() for name, value in model.theta.items()}
     alike = Batch(data.x[:, :1], data.y[:, :1], data.weight[:, :1])  # there is but one minibatch to draw
-    adapted, _, _ = THETA_ALONE(model, expand(theta, 4), h, lambda: alike)
+    adapted, _, _ = THETA_ALONE(model, model.theta_of(4), model.embeddings_of(torch.arange(4)), lambda: alike)
     list(Reptile(1, 0.3, 0.7, 4, batch_size=1).steps(model, alike, THETA_ALONE, torch.Generator()))
-    for name, value in model.parameters_by_name().items():
-        torch.testing.assert_close(value, theta[name] + 0.3 * (adapted[name] - theta[name]).mean(dim=0, keepdim=True))
+    for name, value in model.theta.items():
+        torch.testing.assert_close(value, theta[name] + 0.3 * (adapted[name] - theta[name]).mean(dim=0))
 
 
 @pytest.mark.parametrize("members", [1, 3])
 def test_noise_of_one_embedding_is_that_of_all_situations(members: int) -> None:
     model, data = fresh_model(members, 1), situations()
     model.fit_noise(data)
-    theta, c = expand(model.parameters_by_name(), 4), torch.arange(4)
-    x = data.x.repeat_interleave(members, dim=0)
-    errors = model.predict(theta, model.embeddings_of(c)[:, None], x) - data.y.repeat_interleave(members, dim=0)
-    variance = errors.square().mean(dim=1).view(4, members, -1).mean(dim=0)
+    errors = model(data.x, model.embeddings_of(torch.arange(4))) - data.y[:, None]  # (N, P, n, obs_dim)
+    variance = errors.square().mean(dim=(0, 2))
     torch.testing.assert_close(model.noise_std.square(), variance, rtol=1e-4, atol=1e-6)
 
 

@@ -8,15 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from famle_agent.adaptation.belief import prior
-from famle_agent.adaptation.candidates import Candidates
-from famle_agent.adaptation.memory import Memory
-from famle_agent.adaptation.posterior import systematic_sample
-from famle_agent.adaptation.update import adapt
-from famle_agent.models.gradient_steps import InnerLoop
+from famle_agent.adaptation.adapters import select
+from famle_agent.adaptation.belief import Candidates, prior, systematic_sample
 from tests.helpers import simple_model
-
-NO_STEPS = InnerLoop(0, 1e-3, 1e-2, "adam")
 
 
 def posteriors(weights: list[list[float]]) -> Tensor:
@@ -56,12 +50,11 @@ def test_rows_do_not_depend_on_each_other() -> None:
 def test_candidates_take_turns_from_one_adaptation_to_the_next() -> None:
     model = simple_model(n_situations=4)
     candidates = Candidates.of(model, compose=False)
-    memory = Memory.empty(1, 5, model.obs_dim, model.action_dim, 4, torch.device("cpu"))
     belief = replace(prior(model, candidates, robots=1), log_posterior=posteriors([[4, 3, 2, 1]]).log())
     starts = []
     for _ in range(40):
-        belief = adapt(model, candidates, memory, NO_STEPS, belief, spread=True)
-        starts.append(int((model.embeddings[0] - belief.h).norm(dim=1).argmin()))
+        belief = select(model, candidates, belief, spread=True)
+        starts.append(int((model.embeddings[0] - belief.h[0]).norm(dim=1).argmin()))
     assert torch.bincount(torch.tensor(starts), minlength=4).tolist() == pytest.approx([16, 12, 8, 4], abs=2)
 
 
@@ -69,10 +62,9 @@ def test_candidates_take_turns_from_one_adaptation_to_the_next() -> None:
 def test_members_start_from_situations_of_their_own_only_where_they_are_spread(spread: bool) -> None:
     model = simple_model(n_situations=4, members=4)
     candidates = Candidates.of(model, compose=False)
-    memory = Memory.empty(2, 5, model.obs_dim, model.action_dim, 4, torch.device("cpu"))
     belief = prior(model, candidates, robots=2)
     belief = replace(belief, log_posterior=posteriors([[1, 1, 1, 1], [0, 0, 9, 0]]).log())
-    h = adapt(model, candidates, memory, NO_STEPS, belief, spread=spread).h.view(2, 4, -1)
+    h = select(model, candidates, belief, spread=spread).h
     wanted = [0, 1, 2, 3] if spread else [0, 0, 0, 0]
     for member, situation in enumerate(wanted):
         torch.testing.assert_close(h[0, member], model.embeddings[member, situation])

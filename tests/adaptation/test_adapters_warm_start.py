@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from famle_agent import FAMLE, Transitions
+from famle_agent.adaptation.adapters import descend, select
 from famle_agent.adaptation.belief import Belief
 from famle_agent.adaptation.memory import Memory
-from famle_agent.adaptation.posterior import better_explained
-from famle_agent.adaptation.update import descend, select
 from famle_agent.data.action_scaling import to_action_space
+from famle_agent.models.simulator import Simulator
 
 WINDOW = 6
 DEAD, REVERSED, STRANGE = 4, 6, 11  # joint 3 dead, joint 0 reversed, and what was not trained
@@ -79,7 +79,7 @@ def test_belief_is_judged_by_what_it_has_not_seen(load: Load, data: Transitions,
         tell(agent, data, [DEAD], range(i, i + 1))
         seen = memory(agent)
         newest = model.encode(*(values[:, -1:] for values in (seen.obs, seen.action, seen.next_obs)))
-        expected = before.log_likelihood(model, newest)[:, 0] if keep_adapting else torch.zeros(1)
+        expected = model.log_likelihood(newest, before.h, before.theta)[:, 0] if keep_adapting else torch.zeros(1)
         if agent.belief.adaptations == before.adaptations:  # else it may have begun anew
             torch.testing.assert_close(seen.own_log_p[:, -1], expected)
 
@@ -138,7 +138,7 @@ def test_agent_begins_anew_where_the_situation_changes(load: Load, data: Transit
 def imagined(agent: FAMLE, belief: Belief, data: Transitions) -> Tensor:
     """What a planner with a belief expects of some actions."""
     obs, action = (torch.as_tensor(values[DEAD, :20])[None] for values in (data.obs, data.action))
-    return agent.model.simulator(belief.theta, belief.h)(obs, action)
+    return Simulator(agent.model, belief.h, belief.theta)(obs, action)
 
 
 def planned_with(agent: FAMLE, data: Transitions) -> Tensor:
@@ -150,7 +150,7 @@ def planned_with(agent: FAMLE, data: Transitions) -> Tensor:
 def test_adapted_model_plans_where_no_embedding_is_better(load: Load, data: Transitions) -> None:
     agent = load()
     tell(agent, data, [STRANGE], range(30))
-    assert not better_explained(memory(agent), agent.belief.log_posterior.argmax(dim=1)).any()
+    assert not memory(agent).better_explained(agent.belief.log_posterior.argmax(dim=1)).any()
     torch.testing.assert_close(planned_with(agent, data), imagined(agent, agent.belief, data))
 
 
@@ -158,7 +158,7 @@ def test_embedding_alone_plans_while_steps_lead_astray_and_nothing_is_forgotten(
     agent = load(adapt_lr=0.3)
     tell(agent, data, [DEAD], range(30))
     selected = select(agent.model, agent.candidates, agent.belief)
-    assert better_explained(memory(agent), selected.candidate).all()
+    assert memory(agent).better_explained(selected.candidate).all()
     assert selected.candidate.tolist() == agent.belief.candidate.tolist() == [DEAD]
     assert memory(agent).seen > 2 * WINDOW
     torch.testing.assert_close(planned_with(agent, data), imagined(agent, selected, data))

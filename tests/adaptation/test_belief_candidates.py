@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from famle_agent.adaptation.belief import prior
-from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.belief import Candidates, prior
 from famle_agent.models.dynamics import Batch, Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
 from tests.helpers import adapted, memory_of, models, random_transitions, simple_model
@@ -31,11 +30,11 @@ def test_candidates_are_situations_and_sums_of_two(n: int, compose: bool, member
     model = simple_model(n_situations=n, members=members)
     candidates, pairs, H = Candidates.of(model, compose), expected_pairs(n, compose), model.embeddings
     assert [tuple(pair) for pair in candidates.pairs.tolist()] == pairs
-    assert candidates.h.shape == (members, len(pairs), model.embeddings.shape[-1])
+    assert candidates.h.shape == (1, members, len(pairs), model.embeddings.shape[-1])
     assert not candidates.h.requires_grad
-    assert torch.allclose(candidates.h[:, :n], H, atol=1e-6)
+    assert torch.allclose(candidates.h[0, :, :n], H, atol=1e-6)
     for number, (i, j) in enumerate(pairs):
-        torch.testing.assert_close(candidates.h[:, number], (H[:, i] + H[:, j] - H[:, 0]).detach())
+        torch.testing.assert_close(candidates.h[0, :, number], (H[:, i] + H[:, j] - H[:, 0]).detach())
 
 
 @given(numbers_of_situations, st.booleans())
@@ -76,16 +75,17 @@ def test_marginal_counts_each_situation_where_it_takes_part(n: int, compose: boo
 
 @given(models(), st.booleans(), st.integers(1, 3), st.integers(1, 4))
 def test_likelihood_equals_that_of_each_candidate_alone(model: Dynamics, compose: bool, robots: int, n: int) -> None:
-    candidates, P = Candidates.of(model, compose), model.members
+    candidates = Candidates.of(model, compose)
     data = model.encode(*random_transitions(model, robots, n), (torch.rand(robots, n) > 0.3).float())
     together = candidates.log_likelihood(model, data)
     assert together.shape == (robots, n, len(candidates.pairs))
     assert (together[data.weight == 0] == 0).all()
     for robot in range(robots):
-        rows = Batch(*(values[robot].expand(P, *values.shape[1:]) for values in (data.x, data.y, data.weight)))
+        row = torch.tensor([[robot]])
+        alone = Batch(data.x[row[0]], data.y[row[0]], data.weight[row[0]])
         for number in range(len(candidates.pairs)):
-            each = model.log_likelihood(model.parameters_by_name(), candidates.h[:, number], rows)
-            torch.testing.assert_close(together[robot, :, number], each.mean(dim=0), rtol=1e-4, atol=1e-3)
+            each = model.log_likelihood(alone, candidates.h[:, :, number])
+            torch.testing.assert_close(together[robot, :, number], each[0].detach(), rtol=1e-4, atol=1e-3)
 
 
 def gains(gain: list[float], n: int = 60, seed: int = 3) -> tuple[Tensor, Tensor, Tensor]:
@@ -158,11 +158,11 @@ def test_robots_with_several_members_adapt_as_each_would_alone(
     parts = [gains(gain, 20, seed=9) for gain in ([1.0, 0.0], [0.0, 0.0], [0.5, 1.0])]
     obs, action, next_obs = (torch.cat(values) for values in zip(*parts, strict=True))
     together = adapted(two_motors, candidates, memory_of(two_motors, candidates, obs, action, next_obs), loop)
-    assert together.h.shape == (6, 2)
+    assert together.h.shape == (3, 2, 2)
     for robot in range(3):
         memory = memory_of(two_motors, candidates, *parts[robot])
         alone = adapted(two_motors, candidates, memory, loop)
-        rows = slice(2 * robot, 2 * robot + 2)
+        rows = slice(robot, robot + 1)
         torch.testing.assert_close(alone.h, together.h[rows], rtol=1e-3, atol=1e-4)
         torch.testing.assert_close(alone.log_posterior[0], together.log_posterior[robot], rtol=1e-4, atol=1e-2)
         for name, value in alone.theta.items():
@@ -177,10 +177,10 @@ def test_each_member_starts_from_its_own_embedding(two_motors: Dynamics) -> None
     for member in range(2):
         H = two_motors.embeddings[member].detach()
         for robot in range(2):
-            assert torch.equal(start.h[2 * robot + member], H[0])
-        torch.testing.assert_close(selected.h[member], H[1] + H[2] - H[0])
+            assert torch.equal(start.h[robot, member], H[0])
+        torch.testing.assert_close(selected.h[0, member], H[1] + H[2] - H[0])
         for name, value in two_motors.theta.items():
-            assert torch.equal(selected.theta[name][member], value[member])
+            assert torch.equal(selected.theta[name][0, member], value[member])
 
 
 def test_one_member_that_diverges_leaves_the_whole_robot_where_it_started(two_motors: Dynamics) -> None:
@@ -190,7 +190,7 @@ def test_one_member_that_diverges_leaves_the_whole_robot_where_it_started(two_mo
         two_motors, candidates, obs, action, obs + torch.tensor([1.0, 1e18])[:, None, None] * (next_obs - obs)
     )
     belief = adapted(two_motors, candidates, wild, InnerLoop(20, 1e-4, 1e-2))
-    selected = candidates.h[:, belief.posterior[1].argmax()]
-    assert torch.equal(belief.h[2:], selected)
-    assert not torch.equal(belief.h[:2], candidates.h[:, belief.posterior[0].argmax()])
+    selected = candidates.h[0][:, belief.posterior.argmax(dim=1)]  # (P, B, embedding_dim)
+    assert torch.equal(belief.h[1], selected[:, 1])
+    assert not torch.equal(belief.h[0], selected[:, 0])
     assert belief.is_finite().all()

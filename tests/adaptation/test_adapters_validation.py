@@ -8,10 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation.belief import prior
-from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.adapters import descend, select
+from famle_agent.adaptation.belief import Candidates, prior
 from famle_agent.adaptation.memory import Memory
-from famle_agent.adaptation.update import adapt
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
 from tests.helpers import memory_of, random_transitions, simple_model
@@ -30,7 +29,7 @@ def moved(model: Dynamics, memory: Memory, validation_size: int) -> bool:
     """Whether adapting changed the model."""
     candidates = Candidates.of(model, compose=False)
     start = prior(model, candidates, 1)
-    belief = adapt(model, candidates, memory, STEPS, start, validation_size)
+    belief = descend(model, select(model, candidates, start), memory, STEPS, validation_size)
     changes = {name: not torch.equal(value, start.theta[name]) for name, value in belief.theta.items()}
     assert len(set(changes.values())) == 1
     return changes["weight_0"]
@@ -58,8 +57,8 @@ def test_each_member_is_judged_by_itself() -> None:
     candidates = Candidates.of(model, compose=False)
     memory = remembered(model, candidates, torch.full((30,), 3.0))
     start = prior(model, candidates, 1)
-    belief = adapt(model, candidates, memory, STEPS, start, validation_size=10)
-    same = [torch.equal(belief.theta["bias_2"][p], start.theta["bias_2"][p]) for p in range(2)]
+    belief = descend(model, select(model, candidates, start), memory, STEPS, validation_size=10)
+    same = [torch.equal(belief.theta["bias_2"][0, p], start.theta["bias_2"][0, p]) for p in range(2)]
     assert same == [False, True]
 
 
@@ -70,20 +69,7 @@ def test_steps_do_not_see_the_transitions_that_judge_them() -> None:
     other = memory.next_obs.clone()
     other[:, -10:] += 0.1
     one, two = (
-        adapt(model, candidates, m, STEPS, prior(model, candidates, 1), validation_size=10)
+        descend(model, select(model, candidates, prior(model, candidates, 1)), m, STEPS, validation_size=10)
         for m in (memory, replace(memory, next_obs=other))
     )
     assert torch.equal(one.h, two.h)
-
-
-def test_part_of_an_ensemble_predicts_as_its_members() -> None:
-    model = simple_model(members=3)
-    part = model.with_members(2)
-    x = torch.randn(3, 5, model.n_features + model.action_dim)
-    h = torch.randn(3, 1, model.embeddings.shape[-1])
-    whole = model.predict(model.parameters_by_name(), h, x)
-    torch.testing.assert_close(part.predict(part.parameters_by_name(), h[:2], x[:2]), whole[:2])
-    assert part.members == 2
-    assert model.members == 3
-    with pytest.raises(ValueError, match="1 to 3"):
-        model.with_members(4)

@@ -1,0 +1,170 @@
+"""A model made fast for planning: its situation is fixed, and all that does not change is folded into the weights."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from famle_agent.models.dynamics import Dynamics
+from famle_agent.models.network import Layers, Theta
+from famle_agent.models.observation import ObservationLayout
+from famle_agent.models.reward import RewardFn
+
+__all__ = ["Simulator", "imagine"]
+
+_CANDIDATES_AT_ONCE = {"cpu": 2500, "cuda": 1_000_000}
+"""By kind of device: what stays in a processor's cache over the whole horizon, or fills a GPU."""
+
+
+class Simulator:
+    """Predicts as :meth:`Dynamics.predict` does, for B robots whose theta and h do not change.
+
+    What h does to the first layer, the normalisation and the choice of features become part of the weights.
+
+    Args:
+        model: Says what the parameters mean.
+        h: Embeddings, (B, P, embedding_dim).
+        theta: Parameters, (B, P, ...); None takes theta_meta.
+        within: Least and largest value of each observed number, (B, obs_dim) each, beyond which nothing is predicted;
+            None predicts anything.
+
+    Raises:
+        ValueError: The embeddings have another shape, or the model is of other robots.
+    """
+
+    def __init__(
+        self, model: Dynamics, h: Tensor, theta: Theta | None = None, within: tuple[Tensor, Tensor] | None = None
+    ) -> None:
+        if h.ndim != 3 or h.shape[1] != model.members:
+            raise ValueError(
+                f"Embeddings must have shape (B, {model.members}, embedding_dim) for a model of {model.members} "
+                f"members, as embeddings_of(situations) gives them; got {tuple(h.shape)}."
+            )
+        self._model, (self._robots, self._members) = model, h.shape[:2]
+        theta = model.theta_of(self._robots) if theta is None else theta
+        networks = {name: value.flatten(0, 1) for name, value in theta.items()}  # (B * P, ...)
+        self._layers = _in_units_of_the_environment(model, model.network.folded(networks, h.flatten(0, 1)))
+        self._within: tuple[Tensor, Tensor] | None = None
+        if within is not None:
+            low, high = (bound.repeat_interleave(self._members, dim=0)[:, None] for bound in within)
+            self._within = low, high
+
+    def __call__(self, obs: Tensor, action: Tensor) -> Tensor:
+        """Predicts the next observations in each member, (B, P, n, obs_dim), angles not wrapped.
+
+        Args:
+            obs: Observations, (B, n, obs_dim), or (B, P, n, obs_dim) where the members disagree already.
+            action: Actions in [-1, 1], (B, n, action_dim) or (B, P, n, action_dim).
+        """
+        B, P = self._robots, self._members
+
+        def rows(values: Tensor) -> Tensor:
+            values = values if values.ndim == 4 else values[:, None]
+            return values.expand(B, P, -1, -1).flatten(0, 1)
+
+        return self._step(rows(obs), rows(action)).view(B, P, *obs.shape[-2:])
+
+    def returns(self, reward_fn: RewardFn, obs: Tensor, actions: Tensor) -> Tensor:
+        """Computes what candidate sequences of actions yield, (B, N), a mean over the members of the ensemble.
+
+        A planner finds what a single model is wrong about; that several are wrong in the same way is rarer.
+
+        Args:
+            reward_fn: The reward of a transition.
+            obs: Where the robots are, (B, obs_dim).
+            actions: Candidates in [-1, 1], (B, N, H, action_dim).
+        """
+        obs, actions = (values.repeat_interleave(self._members, dim=0) for values in (obs, actions))
+        of_members = imagine(self._step, reward_fn, obs, actions)  # (B * P, N)
+        return of_members.view(self._robots, self._members, -1).mean(dim=1)
+
+    def _step(self, obs: Tensor, action: Tensor) -> Tensor:
+        """Predicts the next observations from a row for each member of each robot, (B * P, n, ...)."""
+        model = self._model
+        change = model.network.through(self._layers, torch.cat([*_inputs(model.layout, obs), action], dim=-1))
+        if model.network.output_limit:
+            change = change * model.target_std + model.target_mean
+        next_obs = model.layout.advance(obs, change)
+        return next_obs if self._within is None else next_obs.clamp(*self._within)
+
+
+def imagine(model: Callable[[Tensor, Tensor], Tensor], reward_fn: RewardFn, obs: Tensor, actions: Tensor) -> Tensor:
+    """Sums the rewards of candidate sequences in K models (the paper's eq. 13).
+
+    Args:
+        model: One step of many candidates: (K, N, obs_dim), (K, N, action_dim) -> next observations (K, N, obs_dim).
+        reward_fn: The reward of a transition.
+        obs: Where the candidates begin, (K, obs_dim).
+        actions: Candidates in [-1, 1], (K, N, H, action_dim).
+
+    Returns:
+        The return of each candidate, (K, N); -inf where a model left the finite numbers.
+    """
+    at_once = max(1, _CANDIDATES_AT_ONCE.get(obs.device.type, 2500) // len(actions))
+    returns = [_imagine(model, reward_fn, obs, part) for part in torch.split(actions, at_once, dim=1)]
+    return torch.cat(returns, dim=1).nan_to_num(nan=-math.inf, posinf=-math.inf, neginf=-math.inf)
+
+
+def _imagine(model: Callable[[Tensor, Tensor], Tensor], reward_fn: RewardFn, obs: Tensor, actions: Tensor) -> Tensor:
+    state = obs[:, None].expand(-1, actions.shape[1], -1)  # (K, N, obs_dim)
+    total = torch.zeros(actions.shape[:2], device=obs.device)
+    for action in actions.unbind(dim=2):
+        next_state = model(state, action)
+        total = total + reward_fn(state, action, next_state)
+        state = next_state
+    return total
+
+
+def _in_units_of_the_environment(model: Dynamics, layers: Layers) -> Layers:
+    """Folds the normalisation and the choice of features into the outer layers of K networks."""
+    (first_weight, first_bias), (last_weight, last_bias) = layers[0], layers[-1]
+    from_features = first_weight[:, : model.n_features] / model.input_std[:, None]
+    bias = first_bias - (model.input_mean @ from_features)[:, None]
+    from_actions = first_weight[:, model.n_features :]
+    if model.normalise_actions:
+        from_actions = from_actions / model.action_std[:, None]
+        bias = bias - (model.action_mean @ from_actions)[:, None]
+    first = torch.cat([_weights_for_inputs(model.layout, from_features), from_actions], dim=1), bias
+    if not model.network.output_limit:  # a limit stands between the last layer and the units of the environment
+        last_weight = last_weight * model.target_std
+        last_bias = last_bias * model.target_std + model.target_mean
+    return [first, *layers[1:-1], (last_weight, last_bias)]
+
+
+def _inputs(layout: ObservationLayout, obs: Tensor) -> list[Tensor]:
+    """Computes the features of a layout in parts that copy little, to be concatenated in order.
+
+    All of the observation goes in as it is, and all 16 products of a quaternion instead of the 10 that differ.
+    """
+    parts = [obs]
+    if layout.angle_dims:
+        angles = _take(obs, layout.angle_dims)
+        parts += [angles.sin(), angles.cos()]
+    if layout.quaternion_dims:
+        q = _take(obs, layout.quaternion_dims)
+        parts.append((q[..., None] * q[..., None, :]).flatten(-2))
+    return parts
+
+
+def _weights_for_inputs(layout: ObservationLayout, weight: Tensor) -> Tensor:
+    """Turns first-layer weights for features, (K, n_features, out), into those for :func:`_inputs`.
+
+    What enters otherwise or not at all has weights of 0.
+    """
+    other = layout.other_dims
+    from_other, angles, products = weight.tensor_split([len(other), len(other) + 2 * len(layout.angle_dims)], dim=1)
+    plain = weight.new_zeros(len(weight), layout.obs_dim, weight.shape[2])
+    plain[:, other] = from_other
+    square = weight.new_zeros(len(weight), len(layout.quaternion_dims) ** 2, weight.shape[2])
+    square[:, [4 * i + j for i, j in layout.quaternion_pairs]] = products
+    return torch.cat([plain, angles, square], dim=1)
+
+
+def _take(values: Tensor, dims: tuple[int, ...]) -> Tensor:
+    """Takes some of the last dimensions; a view where they follow each other."""
+    if dims == tuple(range(dims[0], dims[-1] + 1)):
+        return values[..., dims[0] : dims[-1] + 1]
+    return values[..., list(dims)]
