@@ -119,34 +119,6 @@ def test_descent_goes_on_from_where_a_belief_is(model: Dynamics, candidates: Can
     assert twice.adaptations == start.adaptations  # who adapts counts
 
 
-@pytest.mark.parametrize("validation_size", [0, 10])
-def test_descent_is_drawn_back_to_what_was_meta_learned(
-    model: Dynamics, candidates: Candidates, held_out: Transitions, validation_size: int
-) -> None:
-    memory, start = memory_of(model, candidates, *tensors_of(held_out)), prior(model, candidates, 11)
-    seen = memory.seen - validation_size  # by the steps
-
-    def way(decay: float) -> Tensor:
-        after = descend(model, start, memory, replace(INNER_LOOP, decay=decay), validation_size).theta
-        return torch.stack([(after[name] - value).square().sum() for name, value in start.theta.items()]).sum()
-
-    assert way(seen) == 0.0
-    assert 0.0 < way(0.5 * seen) < way(0.01 * seen) < way(0.0)
-
-
-def test_each_robot_is_drawn_back_as_far_as_it_has_seen() -> None:
-    torch.manual_seed(0)
-    model = Dynamics(2, 1, n_situations=1, embedding_dim=2, hidden=(6,), members=2)
-    start = prior(model, Candidates.of(model, compose=False), robots=2)
-    obs, action, next_obs, log_p = (torch.randn(2, 8, size) for size in (2, 1, 2, 1))
-    memory = Memory.full(obs, action, next_obs, log_p)
-    memory.weight[0, :6] = 0.0  # two transitions of eight
-    after = descend(model, start, memory, replace(INNER_LOOP, decay=2.0))
-    for name, value in start.theta.items():
-        assert torch.equal(after.theta[name][0], value[0])
-    assert all((after.theta["weight_0"][1, member] != start.theta["weight_0"][1, member]).any() for member in (0, 1))
-
-
 def test_descent_that_diverges_stays_where_it_was(
     model: Dynamics, candidates: Candidates, held_out: Transitions
 ) -> None:
