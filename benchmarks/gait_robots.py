@@ -2,36 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from benchmarks.harness import Result
-from benchmarks.methods import METHODS, Method, about
+from benchmarks.methods import METHODS, Method, about, model_based
+from benchmarks.results import Result
 from benchmarks.task import Task
-from famle_agent import FAMLEWrapper, ModelBasedAgent
+from famle_agent import FAMLEWrapper
 from famle_agent.rollout import rollout
 
 __all__ = ["run"]
 
 
-def run(method: str, task: Task, known: Mapping[str, Method] = METHODS) -> Result:
-    """One replicate: an episode of the test robot."""
-    agent = known[method].agent(task)
-    if not isinstance(agent, ModelBasedAgent):
-        raise ValueError(
-            f"{method} needs more steps than an episode of the {task.robot} has; take a model-based method."
-        )
-    agent.set_random_seed(task.seed)
+def run(method: str, tasks: Sequence[Task], known: Mapping[str, Method] = METHODS) -> list[Result]:
+    """Runs an episode of one test robot."""
+    (task,) = tasks
+    agent = model_based(known[method], task)
     env = FAMLEWrapper(task.make(), agent)
     walk = rollout(env, task.seed, task.later, None if task.later is None else task.strikes_at)
     profile = str(env.get_wrapper_attr("profile"))
     env.close()
-    return {
+    result: Result = {
         "situation": str(task.situation),
         "later": None if task.later is None else str(task.later),
         "profile": profile,
-        **about(agent),
         "gaits": walk.steps,
         "reached": walk.success,
         "fell": walk.fell,
@@ -40,3 +35,4 @@ def run(method: str, task: Task, known: Mapping[str, Method] = METHODS) -> Resul
         "path": np.round(walk.position, 3).tolist(),
         "ms_per_plan": round(1e3 * float(np.median(walk.plan_seconds)), 1),
     }
+    return [result | about(agent)]

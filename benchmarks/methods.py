@@ -32,6 +32,7 @@ __all__ = [
     "about",
     "famle",
     "from_cache",
+    "model_based",
     "shipped",
     "simulated_data",
 ]
@@ -55,7 +56,7 @@ class Method:
     fleet: Callable[[Sequence[Task]], ModelBasedAgent] | None = None
 
     def on(self, tasks: Sequence[Task]) -> BaseAlgorithm:
-        """The agent of one test robot, or of many in step.
+        """Makes the agent of one test robot, or of many in step.
 
         Raises:
             ValueError: The robots of this method run one by one.
@@ -67,26 +68,39 @@ class Method:
         return self.fleet(tasks)
 
 
+def model_based(method: Method, task: Task) -> ModelBasedAgent:
+    """Makes the agent of a test robot for a single episode, which a model-free one learns too little in.
+
+    Raises:
+        ValueError: The method is model-free.
+    """
+    agent = method.agent(task)
+    if not isinstance(agent, ModelBasedAgent):
+        raise ValueError("This method needs more steps than an episode has; take a model-based method.")
+    agent.set_random_seed(task.seed)
+    return agent
+
+
 def about(agent: BaseAlgorithm, robot: int = 0) -> dict[str, Any]:
-    """What a result keeps of its agent: a short name of all settings, its device, and how its adaptations went.
+    """Tells what a result keeps of its agent: device, a short name of all settings, and how its adaptations went.
 
     Args:
         agent: One of ours, or of Stable-Baselines3, of which only the device is known.
         robot: Which of the robots that act in step.
     """
-    known: dict[str, Any] = {"settings": "", "device": agent.device.type}
-    if isinstance(agent, ModelBasedAgent):
-        settings, belief = json.dumps(agent.hyperparameters.to_dict(), sort_keys=True), agent.belief
-        known["settings"] = f"{zlib.crc32(settings.encode()):08x}"
-        known |= {"adaptations": belief.adaptations, "diverged": int(belief.diverged[robot])}
-    return known
+    known = {"device": agent.device.type}
+    if not isinstance(agent, ModelBasedAgent):
+        return known
+    settings, belief = json.dumps(agent.hyperparameters.to_dict(), sort_keys=True), agent.belief
+    name = f"{zlib.crc32(settings.encode()):08x}"
+    return {**known, "settings": name, "adaptations": belief.adaptations, "diverged": int(belief.diverged[robot])}
 
 
 # --- FAMLE ------------------------------------------------------------------------------------------------------------
 
 
 def from_cache(agent: Agent, path: Path, learn: Callable[[Agent], object] = lambda agent: agent.meta_learn()) -> Agent:
-    """An agent with the model in a file, where that was learnt as this agent would; else it learns one, and saves it.
+    """Gives an agent the model in a file, where that was learnt as this agent would; else it learns one and saves it.
 
     How it adapts and plans is the agent's own: a model outlasts a change of these settings.
     """
@@ -99,7 +113,7 @@ def from_cache(agent: Agent, path: Path, learn: Callable[[Agent], object] = lamb
 
 
 def famle(task: Task, **overrides: Any) -> FAMLE:
-    """FAMLE with the model that the package ships, or where it ships none a model of the replicate's own."""
+    """Makes FAMLE with the model that the package ships, or where it ships none a model of the replicate's own."""
     if is_shipped(task.robot):
         return shipped(task.robot, task.seed, **overrides)
     agent = FAMLE(task.robot, seed=task.seed, device=task.device, **overrides)
@@ -107,7 +121,7 @@ def famle(task: Task, **overrides: Any) -> FAMLE:
 
 
 def shipped(robot: str, seed: int, **overrides: Any) -> FAMLE:
-    """The agent that the package ships."""
+    """Makes the agent that the package ships."""
     agent = FAMLE(robot, seed=seed, device="cpu", **overrides)
     if agent.dynamics is None:
         raise RuntimeError(f"The package ships no model that fits; make it with: famle meta-learn --robot {robot}")
@@ -115,7 +129,7 @@ def shipped(robot: str, seed: int, **overrides: Any) -> FAMLE:
 
 
 def oracle(task: Task) -> FAMLE:
-    """The upper line: FAMLE with a model of the very test robot, of as many random transitions as of all situations.
+    """Makes the upper line: FAMLE with a model of the very test robot, of as many transitions as of all situations.
 
     Where the test robot has a profile, its model is of 2,000 of its gaits. It adapts all the same.
     """
@@ -138,7 +152,7 @@ def oracle(task: Task) -> FAMLE:
 
 
 def one_simulator(task: Task) -> FAMLE:
-    """An agent that knows only the intact robot in its simulator, four times as long as FAMLE knows each situation."""
+    """Makes an agent that knows only the intact robot in its simulator, four times as long as FAMLE knows each."""
     n = 4 * known_robots()[task.robot].hyperparameters("ours").transitions_per_situation
     settings: dict[str, Any] = {"pretrained": False, "transitions_per_situation": n, "compose": False, "adapt_every": 0}
     agent = FAMLE(task.robot, seed=0, device="cpu", **settings)
@@ -177,15 +191,15 @@ class MetaTrained:
     simulation: Mapping[str, Any] = field(default_factory=dict)
 
     def method(self) -> Method:
-        """How this agent comes to be."""
+        """Describes how this agent comes to be."""
         return Method(self.agent, self.learn, self.fleet)
 
     def agent(self, task: Task) -> ModelBasedAgent:
-        """The agent of a replicate."""
+        """Makes the agent of a replicate."""
         return self.fleet([task])
 
     def fleet(self, tasks: Sequence[Task]) -> ModelBasedAgent:
-        """One agent whose robots have the networks of their replicates."""
+        """Makes one agent whose robots have the networks of their replicates."""
         task, many = tasks[0], self.learn(tasks[0])
         agent = self._new(task)
         agent.situations, agent.dynamics = many.situations, many.model
@@ -195,7 +209,7 @@ class MetaTrained:
         return agent
 
     def learn(self, task: Task) -> ModelBasedAgent:
-        """The agent with the networks of all replicates, from the cache where it has been learnt before.
+        """Learns the networks of all replicates, or takes them from the cache.
 
         Learning that is stopped goes on from a folder beside the cached file, if it is asked for again.
         """
@@ -217,7 +231,7 @@ class MetaTrained:
 
 
 def simulated_data(task: Task) -> Transitions:
-    """As many transitions of each situation as FAMLE's model has seen, collected once for all methods.
+    """Collects as many transitions of each situation as FAMLE's model has seen, once for all methods.
 
     Where FAMLE goes round, its planned transitions come from that very model: its own rounds began with a poor one,
     which the rivals are spared.
@@ -288,4 +302,5 @@ PPO_METHODS = ("ppo", "ppo-pretrained")
 
 
 def is_shipped(robot: str) -> bool:
+    """Tells whether the package ships a model of a robot."""
     return known_robots()[robot].pretrained is not None

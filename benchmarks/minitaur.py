@@ -11,11 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from benchmarks import command
-from benchmarks.compare import compare
 from benchmarks.gait_robots import run
-from benchmarks.harness import Options
 from benchmarks.reporting.report import show
+from benchmarks.runner import Options, compare, launch
 from benchmarks.task import Task
 from famle_envs import Situation
 from famle_envs.minitaur import HELD_OUT
@@ -36,18 +34,18 @@ class Args(Options):
 
 
 def task_of(experiment: str, seed: int, args: Args) -> Task:
-    """The test robot of a replicate; intact, but for its profile."""
+    """Makes the test robot of a replicate; intact, but for its profile."""
     profile = "simulator" if experiment == "home" else HELD_OUT.name
     return Task("minitaur", seed, Situation(), args.cache, profile)
 
 
 def main(args: Args) -> None:
     """Runs and reports."""
-    folder = args.out / f"minitaur-{args.experiment}"
     methods = args.methods or DEFAULT_METHODS[args.experiment]
-    compare(methods, [task_of(args.experiment, seed, args) for seed in range(args.replicates)], run, folder, args)
-    show(args.out, folder.name)
+    tasks = [task_of(args.experiment, seed, args) for seed in range(args.replicates)]
+    compare(methods, tasks, run, args.out / f"minitaur-{args.experiment}.csv", args)
+    show(args.out, f"minitaur-{args.experiment}")
 
 
 if __name__ == "__main__":
-    command.run(main, Args)
+    launch(main, Args)

@@ -12,11 +12,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from benchmarks import command
-from benchmarks.compare import compare
 from benchmarks.gait_robots import run
-from benchmarks.harness import Options
 from benchmarks.reporting.report import show
+from benchmarks.runner import Options, compare, launch
 from benchmarks.task import Task
 from famle_envs import Situation
 from famle_envs.quadruped import HELD_OUT, LEGS, blocked_leg
@@ -42,7 +40,7 @@ class Args(Options):
 
 
 def task_of(experiment: str, seed: int, args: Args) -> Task:
-    """The test robot of a replicate."""
+    """Makes the test robot of a replicate."""
     leg = blocked_leg(seed % len(LEGS))
     wrong = {
         "yaw": Situation(orientation_error=YAW),
@@ -58,10 +56,10 @@ def main(args: Args) -> None:
     """Runs and reports."""
     for experiment in args.experiments:
         methods = args.methods or DEFAULT_METHODS.get(experiment, (*PARTS, *RIVALS, "oracle"))
-        folder = args.out / f"quadruped-{experiment}"
-        compare(methods, [task_of(experiment, seed, args) for seed in range(args.replicates)], run, folder, args)
-        show(args.out, folder.name)
+        tasks = [task_of(experiment, seed, args) for seed in range(args.replicates)]
+        compare(methods, tasks, run, args.out / f"quadruped-{experiment}.csv", args)
+        show(args.out, f"quadruped-{experiment}")
 
 
 if __name__ == "__main__":
-    command.run(main, Args)
+    launch(main, Args)

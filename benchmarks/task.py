@@ -1,4 +1,4 @@
-"""What a method is put to."""
+"""Test robots."""
 
 from __future__ import annotations
 
@@ -46,6 +46,6 @@ class Task:
         return known_robots()[self.robot].env_id
 
     def make(self) -> gym.Env[Any, Any]:
-        """The test robot."""
+        """Makes the test robot."""
         kwargs: dict[str, Any] = {"profile": self.profile} if self.profile else {}
         return gym.make(self.env_id, situation=self.situation, **kwargs)
