@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks import curves
 from benchmarks.ant_informed import informed
-from benchmarks.methods import METHODS, PPO_METHODS, Method, about, famle, from_cache, model_based
+from benchmarks.methods import METHODS, PPO_METHODS, RIVALS, Method, about, famle, from_cache, model_based
 from benchmarks.reporting.report import show
 from benchmarks.results import Result
 from benchmarks.runner import Options, compare, launch
@@ -73,7 +73,6 @@ class Args(Options):
     """Replicates of one method that act in step at most in "curves", where its robots can do that."""
 
 
-RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
 DEFAULT_METHODS: dict[str, tuple[str, ...]] = {
     "unseen": ("famle", "famle-48", "famle-frozen", "famle-nearest", "famle-theta", "without-embeddings", "informed"),
     "validation": ("famle", "famle-window", "famle-h", "famle-theta", "famle-validated"),

@@ -22,8 +22,6 @@ from famle_agent.data.collect import collect
 from famle_agent.data.policies import make_held_uniform
 from famle_agent.models.dynamics import Dynamics
 
-__all__ = ["informed"]
-
 _IDENTIFIES = 300  # steps, after which FAMLE is sure of its embedding
 
 

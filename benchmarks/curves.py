@@ -19,8 +19,6 @@ from benchmarks.results import Result
 from benchmarks.task import Task
 from famle_agent import ModelBasedAgent
 
-__all__ = ["run"]
-
 
 def run(agent: BaseAlgorithm, tasks: Sequence[Task], steps: int, minutes: float = math.inf) -> list[Result]:
     """Lets an agent learn, adapt or plan, each in its way, on one broken robot or on many in step.

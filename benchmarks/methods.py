@@ -23,20 +23,6 @@ from famle_agent.agents.presets import known_robots
 from famle_agent.data.collect import collect
 from famle_agent.data.policies import make_held_uniform
 
-__all__ = [
-    "META_TRAINED",
-    "METHODS",
-    "PPO_METHODS",
-    "MetaTrained",
-    "Method",
-    "about",
-    "famle",
-    "from_cache",
-    "model_based",
-    "shipped",
-    "simulated_data",
-]
-
 Agent = TypeVar("Agent", bound=ModelBasedAgent)
 
 
@@ -296,6 +282,9 @@ METHODS: dict[str, Method] = {
     "one-simulator": Method(one_simulator, one_simulator),
 }
 """Methods by name."""
+
+RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
+"""The model-based methods that FAMLE is compared with everywhere."""
 
 PPO_METHODS = ("ppo", "ppo-pretrained")
 """Those that need many more steps than the others."""

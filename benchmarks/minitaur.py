@@ -11,14 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from benchmarks.gait_robots import run
+from benchmarks.methods import RIVALS
+from benchmarks.quadruped import run
 from benchmarks.reporting.report import show
 from benchmarks.runner import Options, compare, launch
 from benchmarks.task import Task
 from famle_envs import Situation
 from famle_envs.minitaur import HELD_OUT
 
-RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
 DEFAULT_METHODS = {
     "held-out": ("famle", "famle-frozen", "famle-nearest", "famle-likeliest", *RIVALS, "one-simulator", "oracle"),
     "home": ("one-simulator", "famle-frozen", "famle"),

@@ -16,8 +16,6 @@ from benchmarks.task import Task
 from famle_agent.utils.atomic_write import whole_file
 from famle_envs.wrappers import RandomSituation
 
-__all__ = ["from_scratch", "learn_simulated", "simulated_first"]
-
 SETTINGS: Mapping[str, Mapping[str, Any]] = {
     # 100 steps between updates instead of 2,048, or it would not learn at all in the steps the others need.
     "reacher": {"n_steps": 100, "batch_size": 50},

@@ -21,8 +21,6 @@ import pandas as pd
 
 from famle_agent.utils.atomic_write import whole_file
 
-__all__ = ["Result", "load", "provenance", "rows_of", "store"]
-
 Result = dict[str, Any]
 """What is stored of a replicate, by column."""
 
@@ -51,11 +49,6 @@ def load(path: Path) -> pd.DataFrame:
     except (ValueError, pd.errors.ParserError) as error:
         raise ValueError(f"{path} is damaged ({error}): restore it from git, or delete its damaged rows.") from error
     return table
-
-
-def rows_of(table: pd.DataFrame) -> list[Result]:
-    """Lists the rows of a table, each without its empty cells."""
-    return [{str(name): value for name, value in row.items() if _is_known(value)} for row in table.to_dict("records")]
 
 
 def store(path: Path, rows: Sequence[Result], keys: Sequence[str] = ("method", "seed")) -> None:
@@ -97,10 +90,6 @@ def _cell(name: str, value: Any) -> str | None:
     if value is None:
         return None
     return str(value) if name in _TEXT else json.dumps(value)
-
-
-def _is_known(value: Any) -> bool:
-    return isinstance(value, list | dict) or not pd.isna(value)
 
 
 def _sortable(column: pd.Series[Any]) -> pd.Series[Any]:

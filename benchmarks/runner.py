@@ -22,8 +22,6 @@ from benchmarks.results import Result, load, provenance, store
 from benchmarks.task import Task
 from famle_agent.utils.parallel import Backend, as_completed, parallel
 
-__all__ = ["Batch", "Options", "ReplicateError", "compare", "launch", "run_batches"]
-
 Args = TypeVar("Args")
 
 

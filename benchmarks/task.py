@@ -13,8 +13,6 @@ from famle_agent.agents.presets import known_robots
 from famle_envs import Situation
 from famle_envs.profile import Profile
 
-__all__ = ["Task"]
-
 
 @dataclass(frozen=True)
 class Task:

@@ -59,7 +59,7 @@ class Args:
     robots: tuple[str, ...] = ("reacher", "ant")
     """Robots with all modes."""
     parts: tuple[str, ...] = ("step in turns", "environment", "planning", "control")
-    """Some of these, and "meta-training", which is FAMLE's from scratch."""
+    """What is timed."""
     turns: int = 5
     """Turns of each method; the median counts."""
     turn_steps: int = 50
@@ -129,8 +129,13 @@ def planning(robot: str, args: Args) -> dict[str, float]:
 
     repeats = max(3, args.repeats // 5)
     plan, shooting, raw = _medians(repeats, lambda: ours.predict(obs), lambda: paper.predict(obs), bare)
-    figures = {"our plan (ms)": plan, "the paper's plan (ms)": shooting, "bare products (ms)": raw}
-    return figures | {"ratio of the paper's and bare": shooting / raw, "ratio of the paper's and ours": shooting / plan}
+    return {
+        "our plan (ms)": plan,
+        "the paper's plan (ms)": shooting,
+        "bare products (ms)": raw,
+        "ratio of the paper's and bare": shooting / raw,
+        "ratio of the paper's and ours": shooting / plan,
+    }
 
 
 def control(robot: str, args: Args) -> dict[str, float]:
@@ -149,22 +154,11 @@ def control(robot: str, args: Args) -> dict[str, float]:
     }
 
 
-def meta_training(robot: str, args: Args) -> dict[str, float]:
-    """Times FAMLE's simulation and meta-learning from scratch."""
-    agent = FAMLE(robot, seed=0, device="cpu", pretrained=False)
-    start = time.perf_counter()
-    transitions = agent.collect()
-    collected = time.perf_counter()
-    agent.meta_learn(transitions)
-    return {"simulation (s)": collected - start, "meta-learning (s)": time.perf_counter() - collected}
-
-
 PARTS: Mapping[str, Callable[[str, Args], Mapping[str, Any]]] = {
     STEPS_IN_TURNS: in_turns,
     "environment": environment,
     "planning": planning,
     "control": control,
-    "meta-training": meta_training,
 }
 """What can be timed."""
 

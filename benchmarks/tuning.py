@@ -15,14 +15,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 
-from benchmarks import curves, gait_robots
+from benchmarks import curves, quadruped
 from benchmarks.methods import META_TRAINED, Method
 from benchmarks.reporting.registry import experiment_named
-from benchmarks.results import Result, load, rows_of
+from benchmarks.results import Result, load
 from benchmarks.runner import Options, compare, launch
 from benchmarks.task import Task
 from famle_envs import Situation
@@ -71,15 +72,16 @@ def main(args: Args) -> None:
         for value in args.values
     }
     in_episodes = args.robot in IN_EPISODES
-    run = partial(_run_episodes, args=args, known=known) if in_episodes else partial(gait_robots.run, known=known)
+    run = partial(_run_episodes, args=args, known=known) if in_episodes else partial(quadruped.run, known=known)
     table = args.out / (f"{args.robot}-{args.steps}.csv" if in_episodes else f"{args.robot}.csv")
     try:
         compare(list(known), tasks, run, table, args, known, together=in_episodes)
     finally:
-        results = rows_of(load(table)) if table.exists() else []
+        results = load(table) if table.exists() else pd.DataFrame(columns=["method"])
         for name in known:
-            if scores := [score(args.robot, one) for one in results if one["method"] == name][: args.replicates]:
-                print(f"{args.robot}, {name}: {np.mean(scores):.1f} of", *(f"{value:.1f}" for value in scores))
+            mine = results[results["method"] == name][: args.replicates]
+            if len(scores := mine.apply(score, axis="columns", robot=args.robot)):
+                print(f"{args.robot}, {name}: {scores.mean():.1f} of", *(f"{value:.1f}" for value in scores))
 
 
 def method_with(name: str, setting: str, value: str) -> Method:
@@ -100,7 +102,7 @@ def method_with(name: str, setting: str, value: str) -> Method:
     return replace(recipe, name=f"{recipe.name}-{setting}={value}", settings=settings).method()
 
 
-def score(robot: RobotName, result: Result) -> float:
+def score(result: Mapping[str, Any], robot: RobotName) -> float:
     """Computes what a replicate is judged by: its mean return, its gaits to the goal, or how far it walked."""
     if robot in IN_EPISODES:
         return float(np.mean(result["returns"]))

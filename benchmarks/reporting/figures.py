@@ -13,8 +13,6 @@ from benchmarks.reporting.registry import Kind, style_of
 from benchmarks.reporting.statistics import interquartile_mean, p_value, probability_of_improvement, solved_at
 from benchmarks.reporting.study import ROBOT_ALONE, SUBJECT, Measure, Study
 
-__all__ = ["Row", "figures"]
-
 Row = dict[str, Any]
 """Figures by name; one that is not known is missing, or NaN."""
 

@@ -15,8 +15,6 @@ from benchmarks.reporting.registry import Kind, in_order, style_of
 from benchmarks.reporting.statistics import FEWEST
 from benchmarks.reporting.study import LAST, Study
 
-__all__ = ["document", "headline", "section", "sine_section"]
-
 _SIGNIFICANT = 0.05
 
 Cell = str | Callable[[Row], str]

@@ -17,8 +17,6 @@ from benchmarks.reporting.statistics import interquartile_mean
 from benchmarks.reporting.study import Study, over_steps
 from famle_agent.app.plots import style
 
-__all__ = ["draw", "draw_paths", "draw_times"]
-
 _PAPER: Mapping[str, Any] = {"marker": "D", "color": "0.35", "capsize": 3}
 """How the paper's own figures are drawn."""
 

@@ -15,18 +15,6 @@ from typing import Any, Literal
 import pandas as pd
 import yaml
 
-__all__ = [
-    "EXPERIMENTS",
-    "STYLES",
-    "Experiment",
-    "Kind",
-    "Published",
-    "Style",
-    "experiment_named",
-    "in_order",
-    "style_of",
-]
-
 Kind = Literal["curves", "episode", "gaits", "distance"]
 _FOLDER = Path(__file__).parent
 

@@ -20,8 +20,6 @@ from benchmarks.reporting.study import Study, read_study
 from benchmarks.results import load
 from famle_agent.utils.atomic_write import whole_file
 
-__all__ = ["Report", "show"]
-
 _WIDTH = 180
 _SINE = "Sines from three, four and five points (figure 2)", "sine", "python -m benchmarks.sine"
 _NO_EXPERIMENTS = {"sine", "timing", "identification", "prediction"}
@@ -49,7 +47,7 @@ class Report:
             example = EXPERIMENTS[0].command
             raise FileNotFoundError(f"{self.results} holds no results; run a benchmark first, such as: {example}")
         tables = {study.experiment.name: figures(study) for study in studies}
-        files = {f"{name}.csv": table.round(4).to_csv(lineterminator="\n").encode() for name, table in tables.items()}
+        files = {f"{name}.csv": _csv(table) for name, table in tables.items()}
         files |= _pictures(studies)
         files["report.md"] = self._text(studies, tables, "time.png" in files).encode()
         if (picture := self.results / "sine.png").exists():
@@ -88,6 +86,10 @@ def show(results: Path, name: str) -> None:
     if study is None:
         raise FileNotFoundError(f"{results / name}.csv does not exist; run the benchmark first.")
     Console(width=_WIDTH).print(Markdown(section(study, figures(study), pictures=[])))
+
+
+def _csv(table: pd.DataFrame) -> bytes:
+    return table.round(4).convert_dtypes().to_csv(lineterminator="\n").encode()
 
 
 def _pictures(studies: list[Study]) -> dict[str, bytes]:

@@ -8,17 +8,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-__all__ = [
-    "FEWEST",
-    "Array",
-    "Estimate",
-    "first_crossing",
-    "interquartile_mean",
-    "p_value",
-    "probability_of_improvement",
-    "solved_at",
-]
-
 Array = npt.NDArray[np.float64]
 Estimate = tuple[float, float, float]
 """A figure and its 95 % interval, which is NaN where there are too few replicates for one."""

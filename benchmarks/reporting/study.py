@@ -15,8 +15,6 @@ from benchmarks.reporting.registry import Experiment, Kind, in_order, style_of
 from benchmarks.reporting.statistics import Array, first_crossing, solved_at
 from benchmarks.results import load
 
-__all__ = ["LAST", "ROBOT_ALONE", "STEPS_IN_TURNS", "SUBJECT", "Measure", "Study", "over_steps", "read_study"]
-
 SUBJECT = "famle"
 """The method that all others are compared with."""
 
@@ -25,6 +23,9 @@ STEPS_IN_TURNS, ROBOT_ALONE = "step in turns", "robot alone"
 
 LAST = 5
 """The episodes at the end of a learning curve whose mean stands for where it has got to: a single one is noisy."""
+
+_OPTIONAL = ("situation", "settings", "fleet", "break_at", "recovery", "adaptations", "diverged")
+"""What only some replicates have."""
 
 _NEEDED: Mapping[Kind, tuple[str, ...]] = {
     "curves": ("returns", "lengths", "seconds_per_step"),
@@ -102,10 +103,8 @@ class Study:
     @cached_property
     def scores(self) -> pd.DataFrame:
         """The figures of each replicate; a measure is not known where a method has too few robot steps for it."""
-        scores = pd.DataFrame([_SCORES[self.experiment.kind](self, run) for run in self.runs.to_dict("records")])  # type: ignore[arg-type]
-        scores.insert(0, "method", self.runs["method"])
-        scores.insert(1, "seed", self.runs["seed"])
-        return scores
+        rows = [_SCORES[self.experiment.kind](self, run) | _diverged(run) for _, run in self.runs.iterrows()]
+        return self.runs[["method", "seed"]].join(pd.DataFrame(rows))
 
     def of(self, method: str) -> pd.DataFrame:
         """The figures of the replicates of a method; without a row where it was not measured."""
@@ -126,13 +125,11 @@ class Study:
     @cached_property
     def paired(self) -> bool:
         """Whether each seed has a damage of its own, so that replicates are compared with those of the same seed."""
-        return "situation" in self.runs and self.runs["situation"].nunique() > 1
+        return self.runs["situation"].nunique() > 1
 
     @cached_property
     def breaks(self) -> list[int]:
         """The steps before which robots break on the way; none where they are broken from the first one."""
-        if "break_at" not in self.runs:
-            return []
         return sorted({int(step) for step in self.runs["break_at"].dropna() if step})
 
     @cached_property
@@ -157,7 +154,8 @@ class Study:
                 parts.append(f"{self.steps:,} robot steps instead of {self.experiment.budget:,}")
             short = {method: steps for method, steps in self.lived.items() if steps < self.steps}
             parts += [f"{steps:,} robot steps of {labels}" for steps, labels in _by_number(short)]
-        if mixed := [style_of(method).label for method in self.methods if self._settings_differ(method)]:
+        settings = self.runs.groupby("method", sort=False)["settings"].nunique()  # as far as results know of them
+        if mixed := [style_of(str(method)).label for method in settings.index[settings > 1]]:
             parts.append("settings that differ between replicates of " + " / ".join(mixed))
         often = {method: int(self.of(method)["diverged_often"].sum()) for method in self.methods}
         for n, labels in _by_number({method: n for method, n in often.items() if n}):
@@ -184,10 +182,6 @@ class Study:
             ends = [np.linspace(0, self.experiment.budget, len(speed) + 1)[1:] for speed in runs["speed"]]
             return [pd.Series(speed, index=end, dtype=float) for speed, end in zip(runs["speed"], ends, strict=True)]
         return [pd.Series([x for x, _ in path], dtype=float) for path in runs["path"]]
-
-    def _settings_differ(self, method: str) -> bool:
-        """Whether replicates of a method are of agents with different settings, as far as results know of them."""
-        return "settings" in self.runs and self.runs["settings"][self.runs["method"] == method].nunique() > 1
 
 
 def over_steps(traces: Sequence[pd.Series[float]]) -> pd.DataFrame:
@@ -216,6 +210,7 @@ def read_study(experiment: Experiment, results: Path) -> Study | None:
         if name not in runs or not runs[name].map(_is_known).all():
             raise ValueError(f"{path} is damaged (a row has no {name}): delete that row and run the benchmark again.")
     runs = pd.concat([runs[runs["method"] == method] for method in in_order(set(runs["method"]))], ignore_index=True)
+    runs = runs.reindex(columns=[*runs, *(name for name in _OPTIONAL if name not in runs)])
     return Study(experiment, runs, _step_times(experiment, results / "timing.csv"))
 
 
@@ -244,7 +239,7 @@ def _by_number(numbers: Mapping[str, int]) -> list[tuple[int, str]]:
 # --- the figures of a replicate ---------------------------------------------------------------------------------------
 
 
-def _curve(study: Study, run: Mapping[str, Any]) -> dict[str, float]:
+def _curve(study: Study, run: pd.Series[Any]) -> dict[str, float]:
     returns, lengths, threshold = run["returns"], run["lengths"], study.experiment.threshold
     figures = {
         "first_episode": returns[0],
@@ -255,7 +250,7 @@ def _curve(study: Study, run: Mapping[str, Any]) -> dict[str, float]:
         "solved_at": solved_at(returns, lengths, threshold),
         "first_crossing": first_crossing(returns, lengths, threshold),
         # Robots that act in step, as one batch, have no times of their own.
-        "ms": np.nan if run.get("fleet", np.nan) > 1 else 1e3 * run["seconds_per_step"],
+        "ms": np.nan if run["fleet"] > 1 else 1e3 * run["seconds_per_step"],
     }
     if study.lived[run["method"]] >= study.steps:
         ends = np.cumsum(lengths)
@@ -265,40 +260,36 @@ def _curve(study: Study, run: Mapping[str, Any]) -> dict[str, float]:
         figures["last"] = np.mean(returns[max(0, whole - LAST) : whole])
         solved = solved_at(returns[:whole], lengths[:whole], threshold)
         figures["solved_in_common_steps"] = float(np.isfinite(solved))
-    return figures | _diverged(run)
+    return figures
 
 
-def _episode(study: Study, run: Mapping[str, Any]) -> dict[str, float]:
+def _episode(study: Study, run: pd.Series[Any]) -> dict[str, float]:
     """The return counts since the damage, as if that had lasted for the whole episode."""
-    budget, break_at = study.experiment.budget, run.get("break_at", 0)
-    break_at = 0 if pd.isna(break_at) else break_at
-    recovery = run.get("recovery")
-    return {
-        "return": run["return"] * budget / (budget - break_at),
-        "recovery": np.inf if pd.isna(recovery) else recovery,
-        "ms": run["ms_per_step"]["median"],
-    } | _diverged(run)
+    budget = study.experiment.budget
+    lasted = budget - (0 if pd.isna(run["break_at"]) else run["break_at"])
+    recovery = np.inf if pd.isna(run["recovery"]) else run["recovery"]
+    return {"return": run["return"] * budget / lasted, "recovery": recovery, "ms": run["ms_per_step"]["median"]}
 
 
-def _journey(study: Study, run: Mapping[str, Any]) -> dict[str, float]:
+def _journey(study: Study, run: pd.Series[Any]) -> dict[str, float]:
     """A run that does not reach its goal counts as one gait more than there are."""
     gaits = run["gaits"] if run["reached"] else study.experiment.budget + 1
-    return {"gaits": gaits, "reached": run["reached"], "ms": run["ms_per_plan"]} | _diverged(run)
+    return {"gaits": gaits, "reached": run["reached"], "ms": run["ms_per_plan"]}
 
 
-def _walk(study: Study, run: Mapping[str, Any]) -> dict[str, float]:
+def _walk(study: Study, run: pd.Series[Any]) -> dict[str, float]:
     x = np.array(run["path"])[:, 0]
-    figures = {"distance": run["distance"], "furthest": x.max(), "furthest_after": x.argmax()}
-    return figures | {"fell": run["fell"], "ms": run["ms_per_plan"]} | _diverged(run)
+    furthest = {"furthest": x.max(), "furthest_after": x.argmax()}
+    return {"distance": run["distance"], "fell": run["fell"], "ms": run["ms_per_plan"], **furthest}
 
 
-def _diverged(run: Mapping[str, Any]) -> dict[str, float]:
+def _diverged(run: pd.Series[Any]) -> dict[str, float]:
     """The adaptations, those of them that diverged, and whether more than one in ten did; as far as it was counted."""
-    adaptations, diverged = (run.get(name, np.nan) for name in ("adaptations", "diverged"))
+    adaptations, diverged = run["adaptations"], run["diverged"]
     return {"adaptations": adaptations, "diverged": diverged, "diverged_often": 10 * diverged > adaptations}
 
 
-_SCORES: Mapping[Kind, Callable[[Study, Mapping[str, Any]], dict[str, float]]] = {
+_SCORES: Mapping[Kind, Callable[[Study, pd.Series[Any]], dict[str, float]]] = {
     "curves": _curve,
     "episode": _episode,
     "gaits": _journey,

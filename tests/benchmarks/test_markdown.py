@@ -4,17 +4,19 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.reporting.headline import headline
+from benchmarks.reporting.figures import figures
+from benchmarks.reporting.markdown import headline
 from benchmarks.reporting.registry import EXPERIMENTS
 from benchmarks.reporting.report import Report
-from benchmarks.reporting.study import Study, read_study
+from benchmarks.reporting.study import read_study
 from tests.stored_results import store_curves, store_gaits
 
 ROOT = Path(__file__).parents[2]
 
 
-def studies(results: Path) -> list[Study]:
-    return [study for one in EXPERIMENTS if (study := read_study(one, results)) is not None]
+def table_of(results: Path) -> str:
+    studies = [study for one in EXPERIMENTS if (study := read_study(one, results)) is not None]
+    return headline({study.experiment.name: figures(study) for study in studies})
 
 
 @pytest.fixture
@@ -30,7 +32,7 @@ def results(tmp_path: Path) -> Path:
 
 
 def test_table_has_a_row_a_method_and_a_column_an_experiment(results: Path) -> None:
-    assert headline(studies(results)).splitlines() == [
+    assert table_of(results).splitlines() == [
         "| method | arm: return of the first 50 steps | arm: solved after robot steps "
         "| quadruped, yaw error: success, gaits |",
         "| --- | --- | --- | --- |",
@@ -45,10 +47,10 @@ def test_table_has_a_row_a_method_and_a_column_an_experiment(results: Path) -> N
 def test_report_begins_with_the_table(results: Path, tmp_path: Path) -> None:
     Report(results, tmp_path / "report")()
     text = (tmp_path / "report" / "report.md").read_text()
-    assert headline(studies(results)) in text.split("## All robots")[1].split("\n## ")[0]
+    assert table_of(results) in text.split("## All robots")[1].split("\n## ")[0]
 
 
 def test_readme_and_report_show_what_is_stored() -> None:
-    table = headline(studies(ROOT / "benchmarks" / "results"))
+    table = table_of(ROOT / "benchmarks" / "results")
     assert table in (ROOT / "README.md").read_text(), "quote the first table of benchmarks/report/report.md"
     assert table in (ROOT / "benchmarks" / "report" / "report.md").read_text()

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +7,11 @@ import numpy as np
 import pytest
 
 from benchmarks import minitaur, quadruped
-from benchmarks.gait_robots import run
-from benchmarks.harness import Replicate, load_results, run_replicates
 from benchmarks.methods import METHODS
-from benchmarks.reporting.looks import look
+from benchmarks.reporting.registry import style_of
 from benchmarks.reporting.report import show
+from benchmarks.results import load
+from benchmarks.runner import compare
 from benchmarks.task import Task
 from famle_envs import Situation
 from famle_envs.quadruped import QuadrupedEnv
@@ -34,10 +33,9 @@ def test_tests_are_run_on_held_out_dynamics_and_on_damage_that_no_training_situa
 
 @pytest.mark.slow
 def test_replicate_is_stored_with_its_profile_and_summed_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for method in ("famle", "famle-frozen"):
-        task = quadruped.task_of("yaw", 0, quadruped.Args(cache=tmp_path))
-        run_replicates([Replicate(method, 0, partial(run, method, task))], tmp_path / "quadruped-yaw", jobs=1)
-    results = load_results(tmp_path / "quadruped-yaw")
+    args, table = quadruped.Args(cache=tmp_path, jobs=1), tmp_path / "quadruped-yaw.csv"
+    compare(("famle", "famle-frozen"), [quadruped.task_of("yaw", 0, args)], quadruped.run, table, args)
+    results = load(table).to_dict("records")
     for result in results:
         assert result["profile"].startswith("held-out: motor_strength 0.03")
         assert len(result["path"]) == result["gaits"] + 1
@@ -46,7 +44,7 @@ def test_replicate_is_stored_with_its_profile_and_summed_up(tmp_path: Path, caps
     assert results[1]["believed"] == "intact"
     show(tmp_path, "quadruped-yaw")
     shown = capsys.readouterr().out
-    assert all(look(method).label in shown for method in ("famle", "famle-frozen"))
+    assert all(style_of(method).label in shown for method in ("famle", "famle-frozen"))
 
 
 @pytest.mark.parametrize("robot", ["quadruped", "minitaur"])

@@ -5,18 +5,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from benchmarks.ant import ANT_METHODS, BIN, Args, damage_of, run, untrained
-from benchmarks.ant_model import accuracy
-from benchmarks.harness import Replicate, load_results, run_replicates
-from benchmarks.reporting.looks import look
+from benchmarks.reporting.registry import style_of
 from benchmarks.reporting.report import show
+from benchmarks.results import load
+from benchmarks.runner import compare
 from benchmarks.task import Task
 from famle_agent import ModelBasedAgent
-from famle_agent.adaptation.candidates import Candidates
 from famle_envs.ant import AntEnv
-from tests.helpers import simple_model
 
 
 def test_test_damages_are_unseen_and_those_of_tuning_are_others() -> None:
@@ -36,19 +33,23 @@ def test_untrained_damages_are_of_four_kinds() -> None:
 
 
 def test_replicate_is_stored_and_summed_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    args = Args(steps=2 * BIN, out=tmp_path)
-    for method in ("famle", "famle-frozen"):
-        task = Task("ant", 0, damage_of("unseen", 0), tmp_path)
-        run_replicates([Replicate(method, 0, partial(run, method, task, args))], tmp_path / "ant-unseen", jobs=1)
-    results = load_results(tmp_path / "ant-unseen")
-    assert [result["method"] for result in results] == ["famle", "famle-frozen"]
+    args, methods, table = Args(steps=2 * BIN, jobs=1), ("famle", "famle-frozen"), tmp_path / "ant-unseen.csv"
+    task = Task("ant", 0, damage_of("unseen", 0), tmp_path)
+    compare(methods, [task], partial(run, args=args), table, args, ANT_METHODS)
+    results = load(table).to_dict("records")
+    assert [result["method"] for result in results] == list(methods)
     for result in results:
         assert result["return"] == pytest.approx(BIN * sum(result["speed"]), abs=0.2)
         assert result["ms_per_step"]["mean"] > 0
     assert results[1]["believed"] == "intact"
     show(tmp_path, "ant-unseen")
     shown = capsys.readouterr().out
-    assert all(look(method).label in shown for method in ("famle", "famle-frozen"))
+    assert all(style_of(method).label in shown for method in methods)
+
+
+def test_single_episode_is_not_for_model_free_methods(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="take a model-based method"):
+        run("ppo", [Task("ant", 0, damage_of("unseen", 0), tmp_path)], Args())
 
 
 @pytest.mark.parametrize("method", ["famle-nearest", "famle-theta", "members-2", "random-shooting"])
@@ -71,12 +72,3 @@ def test_stored_network_is_the_one_that_its_method_would_learn(method: str, monk
     obs, _ = agent.get_env().envs[0].reset(seed=0)
     assert agent.predict(obs)[0].shape == (8,)
     agent.get_env().close()
-
-
-def test_accuracy_counts_the_windows_whose_situation_is_the_likeliest() -> None:
-    candidates = Candidates.of(simple_model(n_situations=2), compose=False)
-    log_p = torch.zeros(2, 6, 2)
-    log_p[0, :, 0] = 1.0  # situation 0 is always named right
-    log_p[1, :, 1] = torch.tensor([1.0, 1.0, 1.0, -9.0, -9.0, 1.0])  # situation 1 in one window of two
-    assert accuracy(log_p, candidates, 3) == 0.75
-    assert accuracy(log_p, candidates, 6) == 0.5
