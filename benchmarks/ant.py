@@ -24,10 +24,9 @@ import numpy as np
 
 from benchmarks import curves
 from benchmarks.ant_informed import informed
-from benchmarks.methods import METHODS, PPO_METHODS, RIVALS, Method, about, famle, from_cache, model_based
-from benchmarks.reporting.report import show
+from benchmarks.methods import METHODS, PPO_METHODS, Method, about, famle, from_cache, model_based
 from benchmarks.results import Result
-from benchmarks.runner import Options, compare, launch
+from benchmarks.runner import Options, launch, run_experiment
 from benchmarks.task import Task
 from famle_agent import FAMLE, FAMLEWrapper
 from famle_agent.agents.presets import known_robots
@@ -71,17 +70,6 @@ class Args(Options):
     """Robot steps of PPO in "curves"."""
     in_step: int = 5
     """Replicates of one method that act in step at most in "curves", where its robots can do that."""
-
-
-DEFAULT_METHODS: dict[str, tuple[str, ...]] = {
-    "unseen": ("famle", "famle-48", "famle-frozen", "famle-nearest", "famle-theta", "without-embeddings", "informed"),
-    "validation": ("famle", "famle-window", "famle-h", "famle-theta", "famle-validated"),
-    "members": ("members-1", "members-2", "members-3", "famle"),
-    "break": ("famle", "famle-window", "famle-frozen"),
-    "untrained": ("famle", "famle-frozen"),
-    "intact": ("famle",),
-    "curves": ("famle", "famle-frozen", *RIVALS, *PPO_METHODS, "informed"),
-}
 
 
 def damage_of(experiment: str, seed: int) -> Situation:
@@ -188,14 +176,12 @@ def _result(result: Rollout, situation: Situation) -> Result:
 
 def main(args: Args) -> None:
     """Runs and reports."""
-    methods = args.methods or DEFAULT_METHODS[args.experiment]
     tasks = [
         Task("ant", seed, damage_of(args.experiment, seed), args.cache, device=args.device)
         for seed in range(args.replicates)
     ]
-    table, together = args.out / f"ant-{args.experiment}.csv", args.experiment == "curves"
-    compare(methods, tasks, partial(run, args=args), table, args, ANT_METHODS, together)
-    show(args.out, table.stem)
+    together = args.experiment == "curves"
+    run_experiment(f"ant-{args.experiment}", tasks, partial(run, args=args), args, ANT_METHODS, together)
 
 
 if __name__ == "__main__":

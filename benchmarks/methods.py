@@ -283,9 +283,6 @@ METHODS: dict[str, Method] = {
 }
 """Methods by name."""
 
-RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
-"""The model-based methods that FAMLE is compared with everywhere."""
-
 PPO_METHODS = ("ppo", "ppo-pretrained")
 """Those that need many more steps than the others."""
 

@@ -11,18 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from benchmarks.methods import RIVALS
 from benchmarks.quadruped import run
-from benchmarks.reporting.report import show
-from benchmarks.runner import Options, compare, launch
+from benchmarks.runner import Options, launch, run_experiment
 from benchmarks.task import Task
 from famle_envs import Situation
 from famle_envs.minitaur import HELD_OUT
-
-DEFAULT_METHODS = {
-    "held-out": ("famle", "famle-frozen", "famle-nearest", "famle-likeliest", *RIVALS, "one-simulator", "oracle"),
-    "home": ("one-simulator", "famle-frozen", "famle"),
-}
 
 
 @dataclass(frozen=True)
@@ -41,10 +34,8 @@ def task_of(experiment: str, seed: int, args: Args) -> Task:
 
 def main(args: Args) -> None:
     """Runs and reports."""
-    methods = args.methods or DEFAULT_METHODS[args.experiment]
     tasks = [task_of(args.experiment, seed, args) for seed in range(args.replicates)]
-    compare(methods, tasks, run, args.out / f"minitaur-{args.experiment}.csv", args)
-    show(args.out, f"minitaur-{args.experiment}")
+    run_experiment(f"minitaur-{args.experiment}", tasks, run, args)
 
 
 if __name__ == "__main__":

@@ -15,10 +15,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.methods import METHODS, RIVALS, Method, about, model_based
-from benchmarks.reporting.report import show
+from benchmarks.methods import METHODS, Method, about, model_based
 from benchmarks.results import Result
-from benchmarks.runner import Options, compare, launch
+from benchmarks.runner import Options, launch, run_experiment
 from benchmarks.task import Task
 from famle_agent import FAMLEWrapper
 from famle_agent.rollout import rollout
@@ -26,12 +25,6 @@ from famle_envs import Situation
 from famle_envs.quadruped import HELD_OUT, LEGS, blocked_leg
 
 YAW = math.radians(30)
-PARTS = ("famle", "famle-frozen", "famle-nearest", "famle-likeliest")
-DEFAULT_METHODS = {
-    "later": (*PARTS, *RIVALS),
-    "gap-home": ("one-simulator", "famle-frozen", "famle"),
-    "gap-held-out": ("one-simulator", "famle-frozen", "famle"),
-}
 
 
 @dataclass(frozen=True)
@@ -83,10 +76,8 @@ def run(method: str, tasks: Sequence[Task], known: Mapping[str, Method] = METHOD
 def main(args: Args) -> None:
     """Runs and reports."""
     for experiment in args.experiments:
-        methods = args.methods or DEFAULT_METHODS.get(experiment, (*PARTS, *RIVALS, "oracle"))
         tasks = [task_of(experiment, seed, args) for seed in range(args.replicates)]
-        compare(methods, tasks, run, args.out / f"quadruped-{experiment}.csv", args)
-        show(args.out, f"quadruped-{experiment}")
+        run_experiment(f"quadruped-{experiment}", tasks, run, args)
 
 
 if __name__ == "__main__":

@@ -15,19 +15,11 @@ import numpy as np
 
 from benchmarks import curves
 from benchmarks.methods import METHODS, PPO_METHODS
-from benchmarks.reporting.report import show
 from benchmarks.results import Result
-from benchmarks.runner import Options, compare, launch
+from benchmarks.runner import Options, launch, run_experiment
 from benchmarks.task import Task
 from famle_envs import Situation
 from famle_envs.reacher import ReacherEnv
-
-MODEL_BASED = (
-    *("famle", "ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml"),
-    *("famle-paper", "ampc-paper", "ampc-reptile-paper", "ampc-fomaml-paper", "ampc-maml-paper"),
-    *("famle-paper-held", "ampc-reptile-paper-held", "ampc-fomaml-paper-held", "ampc-maml-paper-held"),
-    *("famle-original", "ampc-original", "ampc-reptile-original"),
-)
 
 
 @dataclass(frozen=True)
@@ -59,14 +51,11 @@ def run(method: str, tasks: Sequence[Task], args: Args) -> list[Result]:
 
 def main(args: Args) -> None:
     """Runs and reports."""
-    methods = args.methods or (*MODEL_BASED, *PPO_METHODS, "famle-frozen", "oracle")
     tasks = [
         Task("reacher", seed, situation_of(args.damage, seed), args.cache, device=args.device)
         for seed in range(args.replicates)
     ]
-    table = args.out / f"reacher-{args.damage}.csv"
-    compare(methods, tasks, partial(run, args=args), table, args, together=True)
-    show(args.out, table.stem)
+    run_experiment(f"reacher-{args.damage}", tasks, partial(run, args=args), args, together=True)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ from rich.console import Console
 from tqdm import tqdm
 
 from benchmarks.methods import METHODS, Method
+from benchmarks.reporting.registry import experiment_named
+from benchmarks.reporting.report import show
 from benchmarks.results import Result, load, provenance, store
 from benchmarks.task import Task
 from famle_agent.utils.parallel import Backend, as_completed, parallel
@@ -34,7 +36,7 @@ class Options:
     """What all benchmarks can be told. Each runs replicates that are not stored yet, then reports on all that are."""
 
     methods: tuple[str, ...] = ()
-    """Entries of benchmarks.methods.METHODS; by default those that belong to the experiment."""
+    """Entries of benchmarks.methods.METHODS; by default those of the experiment in reporting/experiments.yaml."""
     replicates: int = 10
     """Seeds 0, 1, ..."""
     jobs: int = 2
@@ -81,6 +83,20 @@ def launch(main: Callable[[Args], object], arguments: type[Args], args: list[str
     except (ImportError, OSError, ReplicateError, TypeError, ValueError) as error:
         Console(stderr=True).print(str(error), markup=False, highlight=False)
         sys.exit(2)
+
+
+def run_experiment(
+    name: str,
+    tasks: Sequence[Task],
+    run: Callable[[str, Sequence[Task]], list[Result]],
+    options: Options,
+    known: Mapping[str, Method] = METHODS,
+    together: bool = False,
+) -> None:
+    """Runs an experiment of the report, but for what is stored, and prints its section; see :func:`compare`."""
+    methods = options.methods or experiment_named(name).methods
+    compare(methods, tasks, run, options.out / f"{name}.csv", options, known, together)
+    show(options.out, name)
 
 
 def compare(

@@ -20,14 +20,13 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from benchmarks import curves, quadruped
+from benchmarks import ant, curves, quadruped
 from benchmarks.methods import META_TRAINED, Method
 from benchmarks.reporting.registry import experiment_named
 from benchmarks.results import Result, load
 from benchmarks.runner import Options, compare, launch
 from benchmarks.task import Task
 from famle_envs import Situation
-from famle_envs.ant import AntEnv
 from famle_envs.profile import Profile
 from famle_envs.quadruped import LEGS, blocked_leg
 from famle_envs.reacher import ReacherEnv
@@ -123,7 +122,7 @@ def _arm(i: int, cache: Path) -> Task:
 
 
 def _ant(i: int, cache: Path) -> Task:
-    return Task("ant", i, AntEnv.sample_situation(np.random.default_rng([7, i])), cache)
+    return Task("ant", i, ant.damage_of("validation", i), cache)
 
 
 def _quadruped(i: int, cache: Path) -> Task:

@@ -40,17 +40,17 @@ def _correct_for_many(table: pd.DataFrame) -> None:
 def _row(study: Study, method: str) -> Row:
     scores, style = study.of(method), style_of(method)
     row: Row = {"label": style.label, "replicates": len(scores)}
-    measures = [measure for measure in study.measures if study.has(method, measure)]
-    for measure in measures:
-        row |= _spread(study, method, measure)
+    by_seed = {measure: study.by_seed(measure) for measure in study.measures}
+    for measure, values in by_seed.items():
+        row |= _spread(measure, values, method)
     row |= _KINDS[study.experiment.kind](study, method, scores)
     row["ms"] = scores["ms"].median()
     if method in study.step_times:
         turns, alone = study.step_times[method], study.step_times[ROBOT_ALONE]
         row["step_ms"] = np.median(turns)
         row["times_robot_alone"] = np.median(np.divide(turns, alone))  # a machine may slow down between two turns
-    for measure in measures:
-        row |= _improvement(study, method, measure)
+    for measure, values in by_seed.items():
+        row |= _improvement(measure, values, method, study.paired)
     if adaptations := scores["adaptations"].sum():
         often = int(scores["diverged_often"].sum())
         row |= {"diverged": scores["diverged"].sum() / adaptations, "diverged_replicates": often}
@@ -60,14 +60,16 @@ def _row(study: Study, method: str) -> Row:
     return row
 
 
-def _spread(study: Study, method: str, measure: Measure) -> Row:
+def _spread(measure: Measure, by_seed: pd.DataFrame, method: str) -> Row:
     """Median, quartiles and interquartile mean of a measure, and how much of the oracle's it is."""
-    scores, key = study.of(method)[measure.key].to_numpy(float), measure.key
+    key, scores = measure.key, by_seed[method].dropna()
+    if scores.empty:
+        return {}
     row = _quartiles(key, scores) | dict(zip(_estimate(f"{key}_iqm"), interquartile_mean(scores), strict=True))
-    if pair := study.shared(method, "oracle", measure):
-        ours, oracle = (interquartile_mean(values)[0] for values in pair)
+    if "oracle" in by_seed and len(pair := by_seed[[method, "oracle"]].dropna()):
+        ours, oracle = (interquartile_mean(values)[0] for values in pair.to_numpy().T)
         over, under = (ours, oracle) if measure.higher_is_better else (oracle, ours)
-        row |= {f"{key}_of_oracle": over / under if under > 0 else np.nan, f"{key}_oracle_seeds": len(pair[0])}
+        row |= {f"{key}_of_oracle": over / under if under > 0 else np.nan, f"{key}_oracle_seeds": len(pair)}
     return row
 
 
@@ -80,22 +82,17 @@ def _estimate(name: str) -> tuple[str, str, str]:
     return name, f"{name}_low", f"{name}_high"
 
 
-def _improvement(study: Study, method: str, measure: Measure) -> Row:
+def _improvement(measure: Measure, by_seed: pd.DataFrame, method: str, paired: bool) -> Row:
     """The probability that a replicate of FAMLE is better than one of another method."""
-    if method == SUBJECT or not study.has(SUBJECT, measure):
+    if method == SUBJECT or SUBJECT not in by_seed:
         return {}
-    if study.paired:
-        groups = study.shared(SUBJECT, method, measure)
-    else:
-        ours, theirs = (study.of(name)[measure.key].to_numpy(float) for name in (SUBJECT, method))
-        groups = ours, theirs
-    if groups is None:
+    pair = by_seed[[SUBJECT, method]] * (1 if measure.higher_is_better else -1)
+    ours, theirs = (pair.dropna()[name] if paired else pair[name].dropna() for name in (SUBJECT, method))
+    if ours.empty or theirs.empty:
         return {}
-    ours, theirs = groups if measure.higher_is_better else (-groups[0], -groups[1])
-    name = f"{measure.key}_famle_better"
-    probability = probability_of_improvement(ours, theirs, study.paired)
-    p = np.nan if np.isnan(probability[1]) else p_value(ours, theirs, study.paired)
-    return {f"{name}_seeds": len(theirs), f"{name}_p": p} | dict(zip(_estimate(name), probability, strict=True))
+    name, estimate = f"{measure.key}_famle_better", probability_of_improvement(ours, theirs, paired)
+    p = np.nan if np.isnan(estimate[1]) else p_value(ours, theirs, paired)
+    return {f"{name}_seeds": len(theirs), f"{name}_p": p} | dict(zip(_estimate(name), estimate, strict=True))
 
 
 # --- what only one kind of experiment has -----------------------------------------------------------------------------
@@ -104,13 +101,13 @@ def _improvement(study: Study, method: str, measure: Measure) -> Row:
 def _curves(study: Study, method: str, scores: pd.DataFrame) -> Row:
     row: Row = {
         "second_episode_median": scores["second_episode"].median(),
-        "robot_steps": study.lived[method],
+        "robot_steps": study.robot_steps[method],
         "solved": int(np.isfinite(scores["solved_at"]).sum()),
         "solved_at": scores["solved_at"].median(),
         "first_crossing": scores["first_crossing"].median(),
         **_quartiles("end", scores["end"]),
     }
-    if study.has(method, study.measures[-1]):
+    if study.robot_steps[method] >= study.steps:
         row["solved_in_common_steps"] = int(scores["solved_in_common_steps"].sum())
     if method != SUBJECT and SUBJECT in study.methods:
         famle = study.of(SUBJECT)

@@ -20,7 +20,7 @@ _SIGNIFICANT = 0.05
 Cell = str | Callable[[Row], str]
 """A template of figures, or a function of them; it is filled with a dash where a figure is not known."""
 
-_HOW_TO_READ: Mapping[str, str] = yaml.safe_load(Path(__file__).with_name("how-to-read.yaml").read_text())
+_TEXTS: Mapping[str, str] = yaml.safe_load(Path(__file__).with_name("texts.yaml").read_text())
 
 
 def document(
@@ -34,7 +34,7 @@ def document(
         unknown: Tables of results that are no entry of the registry.
         times: Whether there is a picture of returns against time.
     """
-    parts = ["# Results", _HOW_TO_READ["report"], *sections]
+    parts = ["# Results", _TEXTS["report"], *sections]
     if times:
         parts += [
             "## Return against time",
@@ -71,7 +71,7 @@ def section(study: Study, figures: pd.DataFrame, pictures: Sequence[str]) -> str
         spreads.append(("of the oracle", partial(_of_oracle, key=measure.key)))
         improvements.append((f"P(FAMLE better), {measure.label}", partial(_better, key=measure.key)))
     parts = [f"## {study.title}", *(f"![{experiment.title}]({picture})" for picture in pictures)]
-    parts += [_by_method(columns, rows), _HOW_TO_READ[experiment.kind].format_map(about), _by_method(spreads, measured)]
+    parts += [_by_method(columns, rows), _TEXTS[experiment.kind].format_map(about), _by_method(spreads, measured)]
     if compared := [row for row in measured if f"{study.measures[0].key}_famle_better" in row]:
         parts += [_by_method(improvements, compared), _better_than_famle(study, compared)]
     return "\n\n".join([*parts, _sources(study)])

@@ -39,6 +39,7 @@ class Experiment:
     command: str
     shared: str
     budget: int
+    methods: tuple[str, ...] = ()
     threshold: float = math.inf
     paper: tuple[Published, ...] = ()
     paper_replicates: int = 0
@@ -79,7 +80,9 @@ class Style:
 
 def _experiment(entry: Mapping[str, Any]) -> Experiment:
     paper = tuple(Published(**row) for row in entry.get("paper", ()))
-    return Experiment(**{**entry, "shared": " ".join(entry["shared"]), "paper": paper})
+    return Experiment(
+        **{**entry, "shared": " ".join(entry["shared"]), "paper": paper, "methods": tuple(entry["methods"])}
+    )
 
 
 EXPERIMENTS = tuple(map(_experiment, yaml.safe_load((_FOLDER / "experiments.yaml").read_text())))

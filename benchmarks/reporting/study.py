@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.reporting.registry import Experiment, Kind, in_order, style_of
-from benchmarks.reporting.statistics import Array, first_crossing, solved_at
+from benchmarks.reporting.statistics import first_crossing, solved_at
 from benchmarks.results import load
 
 SUBJECT = "famle"
@@ -71,7 +71,7 @@ class Study:
         return {str(method): len(runs) for method, runs in self.runs.groupby("method", sort=False)}
 
     @cached_property
-    def lived(self) -> Mapping[str, int]:
+    def robot_steps(self) -> Mapping[str, int]:
         """The robot steps in whole episodes that all replicates of a method have; of learning curves alone."""
         if self.experiment.kind != "curves":
             return {}
@@ -80,7 +80,7 @@ class Study:
     @cached_property
     def steps(self) -> int:
         """The robot steps over which methods are compared: FAMLE's, without FAMLE those that all methods have."""
-        return self.lived.get(SUBJECT) or min(self.lived.values(), default=0)
+        return self.robot_steps.get(SUBJECT) or min(self.robot_steps.values(), default=0)
 
     @cached_property
     def measures(self) -> tuple[Measure, ...]:
@@ -110,17 +110,9 @@ class Study:
         """The figures of the replicates of a method; without a row where it was not measured."""
         return self.scores[self.scores["method"] == method]
 
-    def has(self, method: str, measure: Measure) -> bool:
-        """Whether the replicates of a method are measured so."""
-        return method in self.methods and bool(self.of(method)[measure.key].notna().all())
-
-    def shared(self, method: str, other: str, measure: Measure) -> tuple[Array, Array] | None:
-        """A figure of two methods over the seeds that both have, each (n,); None without such seeds."""
-        if not (self.has(method, measure) and self.has(other, measure)):
-            return None
-        ours, theirs = (self.of(name).set_index("seed")[measure.key] for name in (method, other))
-        both = pd.concat([ours, theirs], axis=1, join="inner").sort_index().to_numpy(float)
-        return (both[:, 0], both[:, 1]) if len(both) else None
+    def by_seed(self, measure: Measure) -> pd.DataFrame:
+        """A figure of each replicate: a row a seed, a column a method; NaN where it is not known."""
+        return self.scores.pivot(index="seed", columns="method", values=measure.key).astype(float)
 
     @cached_property
     def paired(self) -> bool:
@@ -152,7 +144,7 @@ class Study:
             longest = max(map(max, self.runs["lengths"]))
             if self.steps + longest <= self.experiment.budget:
                 parts.append(f"{self.steps:,} robot steps instead of {self.experiment.budget:,}")
-            short = {method: steps for method, steps in self.lived.items() if steps < self.steps}
+            short = {method: steps for method, steps in self.robot_steps.items() if steps < self.steps}
             parts += [f"{steps:,} robot steps of {labels}" for steps, labels in _by_number(short)]
         settings = self.runs.groupby("method", sort=False)["settings"].nunique()  # as far as results know of them
         if mixed := [style_of(str(method)).label for method in settings.index[settings > 1]]:
@@ -252,7 +244,7 @@ def _curve(study: Study, run: pd.Series[Any]) -> dict[str, float]:
         # Robots that act in step, as one batch, have no times of their own.
         "ms": np.nan if run["fleet"] > 1 else 1e3 * run["seconds_per_step"],
     }
-    if study.lived[run["method"]] >= study.steps:
+    if study.robot_steps[run["method"]] >= study.steps:
         ends = np.cumsum(lengths)
         whole = int(np.searchsorted(ends, study.steps, side="right"))
         weights = np.diff(np.minimum(ends, study.steps), prepend=0)

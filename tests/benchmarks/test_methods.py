@@ -10,9 +10,10 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from benchmarks import curves, methods, reacher
+from benchmarks import curves, methods
+from benchmarks.ant import ANT_METHODS
 from benchmarks.methods import META_TRAINED, METHODS, ORIGINAL_CANDIDATES, PPO_METHODS, MetaTrained, about
-from benchmarks.reporting.registry import experiment_named
+from benchmarks.reporting.registry import EXPERIMENTS, experiment_named
 from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent
 from famle_agent.agents import simulation
 from famle_agent.agents.presets import known_robots
@@ -123,7 +124,8 @@ def test_results_tell_settings_apart(cache: Path) -> None:
 
 
 def test_every_benchmark_knows_its_methods() -> None:
-    assert {*reacher.MODEL_BASED, *PPO_METHODS, "famle-frozen", "oracle"} <= set(METHODS)
+    assert {name for one in EXPERIMENTS for name in one.methods if one.robot != "ant"} <= set(METHODS)
+    assert {name for one in EXPERIMENTS for name in one.methods} <= {*METHODS, *ANT_METHODS}
     assert {name for name, method in METHODS.items() if method.fleet is not None} == set(IN_STEP)
 
 
