@@ -36,11 +36,7 @@ def document(
     """
     parts = ["# Results", _TEXTS["report"], *sections]
     if times:
-        parts += [
-            "## Return against time",
-            "![Return against the time of a control step](time.png)",
-            "Interquartile means; times in one run where there are any, else those of the replicates.",
-        ]
+        parts.append(_TEXTS["times"])
     if missing:
         rows = [(title, f"`{where}`", f"`{command}`") for title, where, command in missing]
         parts += ["## Not measured", _table(("experiment", "results", "command"), rows)]
@@ -221,12 +217,6 @@ def _sources(study: Study) -> str:
 
 # --- all robots in one table ------------------------------------------------------------------------------------------
 
-_HEADLINE_METHODS = (
-    *("famle", "ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml", "ppo", "ppo-pretrained", "informed", "oracle"),
-    *("famle-paper", "ampc-paper", "ampc-reptile-paper", "ampc-fomaml-paper", "ampc-maml-paper"),
-    *("famle-original", "ampc-original", "ampc-reptile-original"),
-)
-
 
 def _median(row: Row, key: str) -> str:
     return _spread(row, key) if row["replicates"] >= FEWEST else _rounded(row, f"{key}_median")[0]
@@ -262,14 +252,12 @@ def headline(figures: Mapping[str, pd.DataFrame]) -> str:
     """
     columns = [column for column in _HEADLINE if column[0] in figures]
     rows = {name: dict(zip(figures[name].index, _rows(figures[name]), strict=True)) for name, *_ in columns}
-    methods = in_order({method for table in rows.values() for method in table} & set(_HEADLINE_METHODS))
-    lines = [
-        [
-            style_of(method).label,
-            *(cell(rows[name][method]) if method in rows[name] else "" for name, _, cell in columns),
-        ]
-        for method in methods
-    ]
+    measured = {method for table in rows.values() for method in table}
+    methods = [method for method in in_order(measured) if style_of(method).headline]
+    lines = []
+    for method in methods:
+        cells = (cell(rows[name][method]) if method in rows[name] else "" for name, _, cell in columns)
+        lines.append([style_of(method).label, *cells])
     counts = []
     for name, table in rows.items():
         n = sorted({table[method]["replicates"] for method in methods if method in table})
@@ -290,14 +278,5 @@ def sine_section(title: str, stored: pd.DataFrame) -> str:
     for points in stored["points"].unique():
         better = f"{100 * errors[points, 'FAMLE']['famle_better_than_maml']:.0f} %"
         rows.append([str(points), *(spread.format_map(errors[points, method]) for method in methods), better])
-    first = stored.iloc[0]
-    parts = [
-        f"## {title}",
-        "![A sine from three, four and five points](sine.png)",
-        f"{first['title']}: median (quartiles), and on how many sines FAMLE does better. The picture shows the sine on "
-        "which the ratio of both errors is the median. *Selection only* is FAMLE without gradient steps. The paper has "
-        "pictures of single sines and no figures.",
-        _table(["points", *methods, "FAMLE better than MAML"], rows),
-        f"`{first['command']}` at `{first['commit']}` made the result.",
-    ]
-    return "\n\n".join(parts)
+    about = {**stored.iloc[0], "table": _table(["points", *methods, "FAMLE better than MAML"], rows)}
+    return f"## {title}\n\n{_TEXTS['sine'].format_map(about)}"

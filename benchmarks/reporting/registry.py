@@ -70,19 +70,19 @@ class Style:
         colour: Of its line, box or point.
         line: Style of its line.
         paper: The paper's name of what it stands beside.
+        headline: Whether the table of all robots has a row of it.
     """
 
     label: str
     colour: str
     line: str = "-"
     paper: str = ""
+    headline: bool = False
 
 
 def _experiment(entry: Mapping[str, Any]) -> Experiment:
-    paper = tuple(Published(**row) for row in entry.get("paper", ()))
-    return Experiment(
-        **{**entry, "shared": " ".join(entry["shared"]), "paper": paper, "methods": tuple(entry["methods"])}
-    )
+    paper, methods = tuple(Published(**row) for row in entry.get("paper", ())), tuple(entry["methods"])
+    return Experiment(**{**entry, "shared": " ".join(entry["shared"]), "paper": paper, "methods": methods})
 
 
 EXPERIMENTS = tuple(map(_experiment, yaml.safe_load((_FOLDER / "experiments.yaml").read_text())))

@@ -50,13 +50,17 @@ class Report:
         files = {f"{name}.csv": _csv(table) for name, table in tables.items()}
         files |= _pictures(studies)
         files["report.md"] = self._text(studies, tables, "time.png" in files).encode()
-        if (picture := self.results / "sine.png").exists():
-            files["sine.png"] = picture.read_bytes()
+        if self._has_sines:
+            files["sine.png"] = (self.results / "sine.png").read_bytes()
         self.out.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
             with whole_file(self.out / name) as partial:
                 partial.write_bytes(content)
         Console().print(f"{self.out / 'report.md'}: {len(studies)} of {len(EXPERIMENTS)} experiments.")
+
+    @property
+    def _has_sines(self) -> bool:
+        return all((self.results / name).exists() for name in ("sine.csv", "sine.png"))
 
     def _text(self, studies: list[Study], tables: Mapping[str, pd.DataFrame], times: bool) -> str:
         sections = [f"## All robots\n\n{headline(tables)}"]
@@ -67,7 +71,7 @@ class Report:
             sections.append(section(study, tables[name], pictures))
             drawn.add(picture)
         missing = [(one.title, one.name, one.command) for one in EXPERIMENTS if one.name not in tables]
-        if (self.results / "sine.csv").exists():
+        if self._has_sines:
             sections.append(sine_section(_SINE[0], load(self.results / "sine.csv")))
         else:
             missing.append(_SINE)
