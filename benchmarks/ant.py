@@ -22,15 +22,15 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 
-from benchmarks import command, curves
+from benchmarks import curves
 from benchmarks.ant_informed import informed
-from benchmarks.compare import compare
-from benchmarks.harness import Options, Result
-from benchmarks.methods import METHODS, PPO_METHODS, Method, about, famle, from_cache
-from benchmarks.reporting.report import show
+from benchmarks.methods import METHODS, PPO_METHODS, Method, about, famle, from_cache, model_based
+from benchmarks.results import Result
+from benchmarks.runner import Options, launch, run_experiment
 from benchmarks.task import Task
-from famle_agent import FAMLE, FAMLEWrapper, ModelBasedAgent
+from famle_agent import FAMLE, FAMLEWrapper
 from famle_agent.agents.presets import known_robots
+from famle_agent.agents.world_model import WorldModel
 from famle_agent.models.members import with_members as some_of
 from famle_agent.rollout import Rollout, rollout
 from famle_envs import Situation
@@ -74,20 +74,8 @@ class Args(Options):
     """Replicates of one method that act in step at most in "curves", where its robots can do that."""
 
 
-RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
-DEFAULT_METHODS: dict[str, tuple[str, ...]] = {
-    "unseen": ("famle", "famle-48", "famle-frozen", "famle-nearest", "famle-theta", "without-embeddings", "informed"),
-    "validation": ("famle", "famle-window", "famle-h", "famle-theta", "famle-validated"),
-    "members": ("members-1", "members-2", "members-3", "famle"),
-    "break": ("famle", "famle-window", "famle-frozen"),
-    "untrained": ("famle", "famle-frozen"),
-    "intact": ("famle",),
-    "curves": ("famle", "famle-frozen", *RIVALS, *PPO_METHODS, "informed"),
-}
-
-
 def damage_of(experiment: str, seed: int) -> Situation:
-    """The situation of a replicate; only those of "validation" and "members" were looked at while tuning."""
+    """Makes the situation of a replicate; only those of "validation" and "members" were looked at while tuning."""
     if experiment == "intact":
         return Situation()
     if experiment == "untrained":
@@ -98,7 +86,7 @@ def damage_of(experiment: str, seed: int) -> Situation:
 
 
 def untrained(seed: int) -> Situation:
-    """Damage of a kind that no training situation has: two weak joints, a reversed one, a locked one, another floor."""
+    """Draws damage that was not trained: two weak joints, a reversed one, a locked one, another floor."""
     rng = np.random.default_rng([2022, seed])
     gain = np.ones(len(AntEnv.joints))
     one, two = rng.choice(len(gain), size=2, replace=False)
@@ -115,19 +103,19 @@ def untrained(seed: int) -> Situation:
 
 
 def with_members(task: Task, members: int) -> FAMLE:
-    """The shipped agent with fewer members."""
+    """Makes the shipped agent with fewer members."""
     agent = famle(task)
-    agent.dynamics = some_of(agent.model, members)
+    agent.policy.world = WorldModel(some_of(agent.model, members), agent.situations)
     return agent
 
 
 def without_embeddings(task: Task) -> FAMLE:
-    """One model of all situations, as FAMLE after two rounds; it can only follow by gradient steps on theta."""
-    settings, n = known_robots()["ant"].hyperparameters("ours"), len(AntEnv.training_situations)
+    """Learns one model of all situations, as FAMLE after two rounds; it can only follow by gradient steps on theta."""
+    simulation, n = known_robots()["ant"].config("ours").simulation, len(AntEnv.training_situations)
     budget: dict[str, Any] = {
         "rounds": 2,
-        "transitions_per_situation": n * settings.transitions_per_situation,
-        "round_transitions": n * settings.round_transitions,
+        "transitions_per_situation": n * simulation.transitions(0),
+        "round_transitions": n * simulation.transitions(1),
     }
     agent = FAMLE("ant", seed=0, device="cpu", pretrained=False, compose=False, **budget, **ADAPTS)
     path = task.cache / "ant-without-embeddings.zip"
@@ -135,15 +123,15 @@ def without_embeddings(task: Task) -> FAMLE:
     return from_cache(agent, path, lambda agent: agent.meta_learn(mixed, folder=path.with_suffix("")))
 
 
-def in_step(tasks: Sequence[Task], **overrides: Any) -> FAMLE:
-    """The shipped agent for many robots, with settings changed."""
+def _in_step(tasks: Sequence[Task], **overrides: Any) -> FAMLE:
+    """Makes the shipped agent, which can act on many robots."""
     return famle(tasks[0], **overrides)
 
 
 ANT_METHODS = {
     **{name: method for name, method in METHODS.items() if name != "oracle"},
     **{
-        name: Method(partial(famle, **overrides), fleet=partial(in_step, **overrides))
+        name: Method(partial(famle, **overrides), fleet=partial(_in_step, **overrides))
         for name, overrides in VARIANTS.items()
     },
     **{f"members-{n}": Method(partial(with_members, members=n)) for n in (1, 2, 3)},
@@ -153,28 +141,20 @@ ANT_METHODS = {
 """What every robot can be run with, and what was asked of the ant alone."""
 
 
-def run(method: str, task: Task, args: Args) -> Result:
-    """One replicate: broken from the first step, or after 300 steps."""
+def run(method: str, tasks: Sequence[Task], args: Args) -> list[Result]:
+    """Runs one replicate, broken from the first step or after 300 steps; of curves one, or many in step."""
     if args.experiment == "curves":
-        return run_fleet(method, [task], args)[0]
-    agent = ANT_METHODS[method].agent(task)
-    if not isinstance(agent, ModelBasedAgent):
-        raise ValueError(f"{method} learns too little in one episode to be compared in it; see --experiment curves.")
-    agent.set_random_seed(task.seed)
+        steps = args.ppo_steps if method in PPO_METHODS else args.curve_steps
+        return curves.run(ANT_METHODS[method].on(tasks), tasks, steps, args.minutes)
+    (task,) = tasks
+    agent = model_based(ANT_METHODS[method], task)
     break_at = 300 if args.experiment == "break" else 0
     env = FAMLEWrapper(gym.make(ENV_ID, max_episode_steps=args.steps), agent)
     if break_at == 0:
         env.get_wrapper_attr("set_situation")(task.situation)
     result = rollout(env, task.seed, task.situation, break_at)
     env.close()
-    return _result(result, task.situation) | about(agent)
-
-
-def run_fleet(method: str, tasks: Sequence[Task], args: Args) -> list[Result]:
-    """Many episodes of one replicate, or of many in step."""
-    steps = args.ppo_steps if method in PPO_METHODS else args.curve_steps
-    life = args.life("ant-curves", method, [task.seed for task in tasks])
-    return curves.run(ANT_METHODS[method].on(tasks), tasks, steps, life, minutes=args.minutes)
+    return [_result(result, task.situation) | about(agent)]
 
 
 def _result(result: Rollout, situation: Situation) -> Result:
@@ -198,16 +178,13 @@ def _result(result: Rollout, situation: Situation) -> Result:
 
 def main(args: Args) -> None:
     """Runs and reports."""
-    methods = args.methods or DEFAULT_METHODS[args.experiment]
-    folder = args.out / f"ant-{args.experiment}"
     tasks = [
         Task("ant", seed, damage_of(args.experiment, seed), args.cache, device=args.device)
         for seed in range(args.replicates)
     ]
-    fleets = partial(run_fleet, args=args) if args.experiment == "curves" else None
-    compare(methods, tasks, partial(run, args=args), folder, args, ANT_METHODS, fleets)
-    show(args.out, folder.name)
+    together = args.experiment == "curves"
+    run_experiment(f"ant-{args.experiment}", tasks, partial(run, args=args), args, ANT_METHODS, together)
 
 
 if __name__ == "__main__":
-    command.run(main, Args)
+    launch(main, Args)

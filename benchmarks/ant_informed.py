@@ -18,11 +18,10 @@ from torch import Tensor
 from benchmarks.methods import from_cache, shipped, simulated_data
 from benchmarks.task import Task
 from famle_agent import FAMLE, Transitions
+from famle_agent.agents.world_model import WorldModel
 from famle_agent.data.collect import collect
 from famle_agent.data.policies import make_held_uniform
 from famle_agent.models.dynamics import Dynamics
-
-__all__ = ["informed"]
 
 _IDENTIFIES = 300  # steps, after which FAMLE is sure of its embedding
 
@@ -36,15 +35,15 @@ def informed(task: Task) -> FAMLE:
 
 def _learn_on(agent: FAMLE, task: Task) -> None:
     others, (model, h) = simulated_data(task), _as_famle_begins(task)
-    agent.situations, agent.dynamics = (task.situation.label,), _with_embeddings(model, h)
-    own = _of_the_test_robot(agent, task, others.obs.shape[1])
+    alone, policy = (task.situation.label,), agent.policy
+    policy.world = WorldModel(_with_embeddings(model, h), alone)
+    all_of_them = _beside(others, _of_the_test_robot(agent, task, others.obs.shape[1]))
 
-    agent.dynamics = _with_embeddings(model, torch.cat([model.embeddings.detach(), h], dim=1))
-    known, data = agent.begin_model(agent.in_model_units(_beside(others, own)), new=False)
-    for _ in agent.hyperparameters.joint_training(1).steps(known, data, agent.generator):
+    known = _with_embeddings(model, torch.cat([model.embeddings.detach(), h], dim=1))
+    data = known.encode(*policy.builder.tensors(policy.builder.in_model_units(all_of_them)))
+    for _ in policy.config.trainer(1, last=False).fit(known, data, agent.generator):
         pass
-    known.fit_noise(data)
-    agent.dynamics = _with_embeddings(known, known.embeddings.detach()[:, -1:])
+    policy.world = WorldModel(_with_embeddings(known, known.embeddings.detach()[:, -1:]), alone)
 
 
 def _as_famle_begins(task: Task) -> tuple[Dynamics, Tensor]:
@@ -57,10 +56,9 @@ def _as_famle_begins(task: Task) -> tuple[Dynamics, Tensor]:
 
 def _of_the_test_robot(agent: FAMLE, task: Task, n: int) -> Transitions:
     """As many transitions, of which the agent plans as large a part as of its training situations."""
-    settings, robot, name = agent.hyperparameters, [task.make], agent.situations
-    planned = settings.rounds * settings.round_transitions
-    planned = n * planned // (settings.transitions_per_situation + planned)
-    random = collect(robot, name, n - planned, make_held_uniform(settings.action_hold), seed=0)
+    simulation, robot, name = agent.config.simulation, [task.make], agent.situations
+    planned = n * simulation.planned // (simulation.transitions_per_situation + simulation.planned)
+    random = collect(robot, name, n - planned, make_held_uniform(simulation.action_hold), seed=0)
     return random.followed_by(collect(robot, name, planned, agent.planning_policy(), seed=1))
 
 

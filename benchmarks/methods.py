@@ -20,22 +20,10 @@ from benchmarks import ppo
 from benchmarks.task import Task
 from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent, Transitions
 from famle_agent.agents.presets import known_robots
+from famle_agent.agents.world_model import WorldModel
 from famle_agent.data.collect import collect
 from famle_agent.data.policies import make_held_uniform
 from famle_agent.models.members import for_robots
-
-__all__ = [
-    "META_TRAINED",
-    "METHODS",
-    "PPO_METHODS",
-    "MetaTrained",
-    "Method",
-    "about",
-    "famle",
-    "from_cache",
-    "shipped",
-    "simulated_data",
-]
 
 Agent = TypeVar("Agent", bound=ModelBasedAgent)
 
@@ -56,7 +44,7 @@ class Method:
     fleet: Callable[[Sequence[Task]], ModelBasedAgent] | None = None
 
     def on(self, tasks: Sequence[Task]) -> BaseAlgorithm:
-        """The agent of one test robot, or of many in step.
+        """Makes the agent of one test robot, or of many in step.
 
         Raises:
             ValueError: The robots of this method run one by one.
@@ -68,26 +56,39 @@ class Method:
         return self.fleet(tasks)
 
 
+def model_based(method: Method, task: Task) -> ModelBasedAgent:
+    """Makes the agent of a test robot for a single episode, which a model-free one learns too little in.
+
+    Raises:
+        ValueError: The method is model-free.
+    """
+    agent = method.agent(task)
+    if not isinstance(agent, ModelBasedAgent):
+        raise ValueError("This method needs more steps than an episode has; take a model-based method.")
+    agent.set_random_seed(task.seed)
+    return agent
+
+
 def about(agent: BaseAlgorithm, robot: int = 0) -> dict[str, Any]:
-    """What a result keeps of its agent: a short name of all settings, its device, and how its adaptations went.
+    """Tells what a result keeps of its agent: device, a short name of all settings, and how its adaptations went.
 
     Args:
         agent: One of ours, or of Stable-Baselines3, of which only the device is known.
         robot: Which of the robots that act in step.
     """
-    known: dict[str, Any] = {"settings": "", "device": agent.device.type}
-    if isinstance(agent, ModelBasedAgent):
-        settings, belief = json.dumps(agent.hyperparameters.to_dict(), sort_keys=True), agent.belief
-        known["settings"] = f"{zlib.crc32(settings.encode()):08x}"
-        known |= {"adaptations": belief.adaptations, "diverged": int(belief.diverged[robot])}
-    return known
+    known = {"device": agent.device.type}
+    if not isinstance(agent, ModelBasedAgent):
+        return known
+    settings, belief = json.dumps(agent.config.to_dict(), sort_keys=True), agent.belief
+    name = f"{zlib.crc32(settings.encode()):08x}"
+    return {**known, "settings": name, "adaptations": belief.adaptations, "diverged": int(belief.diverged[robot])}
 
 
 # --- FAMLE ------------------------------------------------------------------------------------------------------------
 
 
 def from_cache(agent: Agent, path: Path, learn: Callable[[Agent], object] = lambda agent: agent.meta_learn()) -> Agent:
-    """An agent with the model in a file, where that was learnt as this agent would; else it learns one, and saves it.
+    """Gives an agent the model in a file, where that was learnt as this agent would; else it learns one and saves it.
 
     How it adapts and plans is the agent's own: a model outlasts a change of these settings.
     """
@@ -100,7 +101,7 @@ def from_cache(agent: Agent, path: Path, learn: Callable[[Agent], object] = lamb
 
 
 def famle(task: Task, **overrides: Any) -> FAMLE:
-    """FAMLE with the model that the package ships, or where it ships none a model of the replicate's own."""
+    """Makes FAMLE with the model that the package ships, or where it ships none a model of the replicate's own."""
     if is_shipped(task.robot):
         return shipped(task.robot, task.seed, **overrides)
     agent = FAMLE(task.robot, seed=task.seed, device=task.device, **overrides)
@@ -108,7 +109,7 @@ def famle(task: Task, **overrides: Any) -> FAMLE:
 
 
 def shipped(robot: str, seed: int, **overrides: Any) -> FAMLE:
-    """The agent that the package ships."""
+    """Makes the agent that the package ships."""
     agent = FAMLE(robot, seed=seed, device="cpu", **overrides)
     if agent.dynamics is None:
         raise RuntimeError(f"The package ships no model that fits; make it with: famle meta-learn --robot {robot}")
@@ -116,7 +117,7 @@ def shipped(robot: str, seed: int, **overrides: Any) -> FAMLE:
 
 
 def oracle(task: Task) -> FAMLE:
-    """The upper line: FAMLE with a model of the very test robot, of as many random transitions as of all situations.
+    """Makes the upper line: FAMLE with a model of the very test robot, of as many transitions as of all situations.
 
     Where the test robot has a profile, its model is of 2,000 of its gaits. It adapts all the same.
     """
@@ -125,7 +126,7 @@ def oracle(task: Task) -> FAMLE:
     if task.profile:
         # Collected by hand: no agent meta-learns on a profile, and this one is not to be had on a real robot.
         agent = FAMLE(task.robot, seed=0, device="cpu", pretrained=False, compose=False)
-        hold = make_held_uniform(agent.hyperparameters.action_hold)
+        hold = make_held_uniform(agent.config.simulation.action_hold)
         return from_cache(
             agent,
             path,
@@ -133,14 +134,14 @@ def oracle(task: Task) -> FAMLE:
         )
     probe = FAMLE(task.robot, device="cpu", pretrained=False)
     situations = len(probe.situation_envs().situations)
-    n = situations * probe.hyperparameters.transitions_per_situation
+    n = situations * probe.config.simulation.transitions_per_situation
     agent = FAMLE(task.robot, seed=task.seed, device="cpu", pretrained=False, transitions_per_situation=n)
     return from_cache(agent, path, lambda agent: agent.meta_learn([task.situation]))
 
 
 def one_simulator(task: Task) -> FAMLE:
-    """An agent that knows only the intact robot in its simulator, four times as long as FAMLE knows each situation."""
-    n = 4 * known_robots()[task.robot].hyperparameters("ours").transitions_per_situation
+    """Makes an agent that knows only the intact robot in its simulator, four times as long as FAMLE knows each."""
+    n = 4 * known_robots()[task.robot].config("ours").simulation.transitions_per_situation
     settings: dict[str, Any] = {"pretrained": False, "transitions_per_situation": n, "compose": False, "adapt_every": 0}
     agent = FAMLE(task.robot, seed=0, device="cpu", **settings)
     return from_cache(agent, task.cache / f"{task.robot}-one-simulator.zip", lambda agent: agent.meta_learn(["intact"]))
@@ -178,25 +179,25 @@ class MetaTrained:
     simulation: Mapping[str, Any] = field(default_factory=dict)
 
     def method(self) -> Method:
-        """How this agent comes to be."""
+        """Describes how this agent comes to be."""
         return Method(self.agent, self.learn, self.fleet)
 
     def agent(self, task: Task) -> ModelBasedAgent:
-        """The agent of a replicate."""
+        """Makes the agent of a replicate."""
         return self.fleet([task])
 
     def fleet(self, tasks: Sequence[Task]) -> ModelBasedAgent:
-        """One agent whose robots have the networks of their replicates."""
+        """Makes one agent whose robots have the networks of their replicates."""
         task, many = tasks[0], self.learn(tasks[0])
         agent = self._new(task)
-        agent.situations, agent.dynamics = many.situations, many.model
+        model = many.model
         if not is_shipped(task.robot):
-            agent.dynamics = for_robots(agent.dynamics, [task.seed % self.networks for task in tasks])
-        agent.dynamics.to(agent.device)
+            model = for_robots(model, [task.seed % self.networks for task in tasks])
+        agent.policy.world = WorldModel(model.to(agent.device), many.situations)
         return agent
 
     def learn(self, task: Task) -> ModelBasedAgent:
-        """The agent with the networks of all replicates, from the cache where it has been learnt before.
+        """Learns the networks of all replicates, or takes them from the cache.
 
         Learning that is stopped goes on from a folder beside the cached file, if it is asked for again.
         """
@@ -218,7 +219,7 @@ class MetaTrained:
 
 
 def simulated_data(task: Task) -> Transitions:
-    """As many transitions of each situation as FAMLE's model has seen, collected once for all methods.
+    """Collects as many transitions of each situation as FAMLE's model has seen, once for all methods.
 
     Where FAMLE goes round, its planned transitions come from that very model: its own rounds began with a poor one,
     which the rivals are spared.
@@ -226,8 +227,8 @@ def simulated_data(task: Task) -> Transitions:
     path = task.cache / f"{task.robot}-transitions.npz"
     if not path.exists():
         agent = FAMLE(task.robot, seed=0, device="cpu")
-        settings, transitions = agent.hyperparameters, agent.collect(progress_bar=True, n_jobs=-1)
-        if n := settings.rounds * settings.round_transitions:
+        transitions = agent.collect(progress_bar=True, n_jobs=-1)
+        if n := agent.config.simulation.planned:
             envs = agent.situation_envs()
             planned = collect(envs.sources, envs.situations, n, agent.planning_policy(), seed=1, n_jobs=-1)
             transitions = transitions.followed_by(planned)
@@ -289,4 +290,5 @@ PPO_METHODS = ("ppo", "ppo-pretrained")
 
 
 def is_shipped(robot: str) -> bool:
+    """Tells whether the package ships a model of a robot."""
     return known_robots()[robot].pretrained is not None

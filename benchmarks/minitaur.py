@@ -11,20 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from benchmarks import command
-from benchmarks.compare import compare
-from benchmarks.gait_robots import run
-from benchmarks.harness import Options
-from benchmarks.reporting.report import show
+from benchmarks.quadruped import run
+from benchmarks.runner import Options, launch, run_experiment
 from benchmarks.task import Task
 from famle_envs import Situation
 from famle_envs.minitaur import HELD_OUT
-
-RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
-DEFAULT_METHODS = {
-    "held-out": ("famle", "famle-frozen", "famle-nearest", "famle-likeliest", *RIVALS, "one-simulator", "oracle"),
-    "home": ("one-simulator", "famle-frozen", "famle"),
-}
 
 
 @dataclass(frozen=True)
@@ -36,18 +27,16 @@ class Args(Options):
 
 
 def task_of(experiment: str, seed: int, args: Args) -> Task:
-    """The test robot of a replicate; intact, but for its profile."""
+    """Makes the test robot of a replicate; intact, but for its profile."""
     profile = "simulator" if experiment == "home" else HELD_OUT.name
     return Task("minitaur", seed, Situation(), args.cache, profile)
 
 
 def main(args: Args) -> None:
     """Runs and reports."""
-    folder = args.out / f"minitaur-{args.experiment}"
-    methods = args.methods or DEFAULT_METHODS[args.experiment]
-    compare(methods, [task_of(args.experiment, seed, args) for seed in range(args.replicates)], run, folder, args)
-    show(args.out, folder.name)
+    tasks = [task_of(args.experiment, seed, args) for seed in range(args.replicates)]
+    run_experiment(f"minitaur-{args.experiment}", tasks, run, args)
 
 
 if __name__ == "__main__":
-    command.run(main, Args)
+    launch(main, Args)

@@ -10,25 +10,21 @@ legs take turns.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from benchmarks import command
-from benchmarks.compare import compare
-from benchmarks.gait_robots import run
-from benchmarks.harness import Options
-from benchmarks.reporting.report import show
+import numpy as np
+
+from benchmarks.methods import METHODS, Method, about, model_based
+from benchmarks.results import Result
+from benchmarks.runner import Options, launch, run_experiment
 from benchmarks.task import Task
+from famle_agent import FAMLEWrapper
+from famle_agent.rollout import rollout
 from famle_envs import Situation
 from famle_envs.quadruped import HELD_OUT, LEGS, blocked_leg
 
 YAW = math.radians(30)
-RIVALS = ("ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml")
-PARTS = ("famle", "famle-frozen", "famle-nearest", "famle-likeliest")
-DEFAULT_METHODS = {
-    "later": (*PARTS, *RIVALS),
-    "gap-home": ("one-simulator", "famle-frozen", "famle"),
-    "gap-held-out": ("one-simulator", "famle-frozen", "famle"),
-}
 
 
 @dataclass(frozen=True)
@@ -42,7 +38,7 @@ class Args(Options):
 
 
 def task_of(experiment: str, seed: int, args: Args) -> Task:
-    """The test robot of a replicate."""
+    """Makes the test robot of a replicate."""
     leg = blocked_leg(seed % len(LEGS))
     wrong = {
         "yaw": Situation(orientation_error=YAW),
@@ -54,14 +50,35 @@ def task_of(experiment: str, seed: int, args: Args) -> Task:
     return replace(task, later=wrong["yaw"], strikes_at=5) if experiment == "later" else task
 
 
+def run(method: str, tasks: Sequence[Task], known: Mapping[str, Method] = METHODS) -> list[Result]:
+    """Runs an episode of one test robot that walks by gaits."""
+    (task,) = tasks
+    agent = model_based(known[method], task)
+    env = FAMLEWrapper(task.make(), agent)
+    walk = rollout(env, task.seed, task.later, None if task.later is None else task.strikes_at)
+    profile = str(env.get_wrapper_attr("profile"))
+    env.close()
+    result: Result = {
+        "situation": str(task.situation),
+        "later": None if task.later is None else str(task.later),
+        "profile": profile,
+        "gaits": walk.steps,
+        "reached": walk.success,
+        "fell": walk.fell,
+        "distance": round(float(walk.position[-1, 0]), 3),
+        "believed": walk.situations[-1],
+        "path": np.round(walk.position, 3).tolist(),
+        "ms_per_plan": round(1e3 * float(np.median(walk.plan_seconds)), 1),
+    }
+    return [result | about(agent)]
+
+
 def main(args: Args) -> None:
     """Runs and reports."""
     for experiment in args.experiments:
-        methods = args.methods or DEFAULT_METHODS.get(experiment, (*PARTS, *RIVALS, "oracle"))
-        folder = args.out / f"quadruped-{experiment}"
-        compare(methods, [task_of(experiment, seed, args) for seed in range(args.replicates)], run, folder, args)
-        show(args.out, folder.name)
+        tasks = [task_of(experiment, seed, args) for seed in range(args.replicates)]
+        run_experiment(f"quadruped-{experiment}", tasks, run, args)
 
 
 if __name__ == "__main__":
-    command.run(main, Args)
+    launch(main, Args)

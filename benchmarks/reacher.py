@@ -13,21 +13,13 @@ from typing import Literal
 
 import numpy as np
 
-from benchmarks import command, curves
-from benchmarks.compare import compare
-from benchmarks.harness import Options, Result
+from benchmarks import curves
 from benchmarks.methods import METHODS, PPO_METHODS
-from benchmarks.reporting.report import show
+from benchmarks.results import Result
+from benchmarks.runner import Options, launch, run_experiment
 from benchmarks.task import Task
 from famle_envs import Situation
 from famle_envs.reacher import ReacherEnv
-
-MODEL_BASED = (
-    *("famle", "ampc", "ampc-reptile", "ampc-fomaml", "ampc-maml"),
-    *("famle-paper", "ampc-paper", "ampc-reptile-paper", "ampc-fomaml-paper", "ampc-maml-paper"),
-    *("famle-paper-held", "ampc-reptile-paper-held", "ampc-fomaml-paper-held", "ampc-maml-paper-held"),
-    *("famle-original", "ampc-original", "ampc-reptile-original"),
-)
 
 
 @dataclass(frozen=True)
@@ -45,35 +37,26 @@ class Args(Options):
 
 
 def situation_of(damage: str, seed: int) -> Situation:
-    """The test situation of a replicate; no training, and no tuning, has seen it."""
+    """Makes the test situation of a replicate; no training, and no tuning, has seen it."""
     if damage == "paper":
         return ReacherEnv.presets["paper"]
     return ReacherEnv.sample_situation(np.random.default_rng([2020, seed]), n_faults=2)
 
 
-def run_fleet(method: str, tasks: Sequence[Task], args: Args) -> list[Result]:
-    """One replicate, or many in step."""
+def run(method: str, tasks: Sequence[Task], args: Args) -> list[Result]:
+    """Runs one replicate, or many in step."""
     steps = args.ppo_steps if method in PPO_METHODS else args.steps
-    life = args.life(f"reacher-{args.damage}", method, [task.seed for task in tasks])
-    return curves.run(METHODS[method].on(tasks), tasks, steps, life, minutes=args.minutes)
-
-
-def run(method: str, task: Task, args: Args) -> Result:
-    """One replicate."""
-    return run_fleet(method, [task], args)[0]
+    return curves.run(METHODS[method].on(tasks), tasks, steps, args.minutes)
 
 
 def main(args: Args) -> None:
     """Runs and reports."""
-    methods = args.methods or (*MODEL_BASED, *PPO_METHODS, "famle-frozen", "oracle")
     tasks = [
         Task("reacher", seed, situation_of(args.damage, seed), args.cache, device=args.device)
         for seed in range(args.replicates)
     ]
-    folder = args.out / f"reacher-{args.damage}"
-    compare(methods, tasks, partial(run, args=args), folder, args, run_fleet=partial(run_fleet, args=args))
-    show(args.out, folder.name)
+    run_experiment(f"reacher-{args.damage}", tasks, partial(run, args=args), args, together=True)
 
 
 if __name__ == "__main__":
-    command.run(main, Args)
+    launch(main, Args)

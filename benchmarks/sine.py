@@ -25,17 +25,16 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 from scipy.stats import trim_mean
 from torch import Tensor
 
-from benchmarks import command
-from benchmarks.harness import Result, provenance, write_json
-from benchmarks.reporting.statistics import interquartile_mean, quartiles
+from benchmarks.reporting.statistics import interquartile_mean
+from benchmarks.results import Result, provenance, store
+from benchmarks.runner import launch
 from famle_agent.adaptation.adapters import descend, select
 from famle_agent.adaptation.belief import Candidates, prior, window_posterior
 from famle_agent.adaptation.memory import Memory
@@ -75,7 +74,7 @@ class Args:
     maml_iterations: int = 3000
     """Iterations of MAML, of two inner steps each; as many as fit the same time."""
     out: Path = Path("benchmarks/results")
-    """Folder of sine.json and sine.png."""
+    """Folder of sine.csv and sine.png."""
 
     def __post_init__(self) -> None:
         counts = {name: value for name, value in asdict(self).items() if name != "out"}
@@ -104,11 +103,11 @@ class Sines:
         return cls(amplitude, math.pi * torch.rand(size, 1, generator=generator))
 
     def __call__(self, x: Tensor) -> Tensor:
-        """The sines' values y, (B, n), at x of (B, n) or (n,)."""
+        """Computes the sines' values y, (B, n), at x of (B, n) or (n,)."""
         return self.amplitude * torch.sin(x + self.phase)
 
     def observe(self, n: int, generator: torch.Generator) -> Memory:
-        """The transitions x -> x + y at n random places on each sine."""
+        """Makes the transitions x -> x + y at n random places on each sine."""
         x = 10.0 * torch.rand(len(self.phase), n, generator=generator) - 5.0
         obs, next_obs = x[..., None], (x + self(x))[..., None]
         nothing = torch.zeros(*x.shape, 0)
@@ -130,7 +129,7 @@ class Learner:
     seconds: float
 
     def fit(self, points: Memory) -> Tensor:
-        """Algorithm 2's lines 6 and 7, then y on GRID for each of B sines, (B, 200)."""
+        """Runs lines 6 and 7 of Algorithm 2, and predicts y on GRID for each of B sines, (B, 200)."""
         sines, alone = len(points.weight), Candidates.of(self.model, compose=False)
         data = self.model.encode(points.obs, points.action, points.next_obs, points.weight)
         points = replace(points, log_p=alone.log_likelihood(self.model, data))
@@ -141,13 +140,13 @@ class Learner:
         return (predicted - x)[..., 0].detach()
 
     def errors(self, sines: Sines, points: Memory) -> Tensor:
-        """Mean squared error over GRID with the first 3, 4 and 5 points, (3, B); infinite where the steps diverged."""
+        """Computes mean squared errors over GRID from 3, 4 and 5 points, (3, B); infinite where the steps diverged."""
         errors = [(self.fit(first(points, n)) - sines(GRID)).square().mean(dim=1) for n in N_POINTS]
         return torch.stack(errors).nan_to_num(nan=math.inf)
 
 
 def first(points: Memory, n: int) -> Memory:
-    """The first n points of each sine."""
+    """Takes the first n points of each sine."""
     return Memory(**{name: values[:, :n] for name, values in vars(points).items()})
 
 
@@ -165,7 +164,7 @@ def meta_learn(learn: Reptile | MAML, data: Memory, n_situations: int, inner_loo
 
 
 def choose_rates(learner: Learner, rates: tuple[InnerLoop, ...], sines: Sines, points: Memory) -> Learner:
-    """The learner with the rates of the least interquartile mean error over all validation fits."""
+    """Takes the rates of the least interquartile mean error over all validation fits."""
 
     def error(candidate: Learner) -> float:
         return float(trim_mean(candidate.errors(sines, points).double().numpy().ravel(), 0.25))
@@ -195,35 +194,6 @@ def learners(args: Args, seed: int, generator: torch.Generator) -> dict[str, Lea
     }
 
 
-def summary(errors: list[NDArray[np.float64]]) -> Result:
-    """Statistics of the errors of one method with one number of points; an array a replicate.
-
-    The interval is over the test sines, with the meta-trained models as they are.
-    """
-    pooled = np.concatenate(errors)
-    lower, median, upper = quartiles(pooled)
-    mean, interval = interquartile_mean(pooled)
-    return {
-        "median": float(median),
-        "quartiles": [float(lower), float(upper)],
-        "iqm": mean,
-        "iqm_interval": list(interval or ()),
-        "iqm_per_replicate": [float(trim_mean(values, 0.25)) for values in errors],
-    }
-
-
-def table(statistics: dict[str, dict[str, Result]], title: str) -> Table:
-    """The statistics by number of points and method."""
-    result = Table("points", "method", "median", "quartiles", "IQM", "95 % interval", title=title)
-    for n in map(str, N_POINTS):
-        for method, by_points in statistics.items():
-            row = by_points[n]
-            pairs = [" to ".join(f"{bound:.3f}" for bound in row[key]) for key in ("quartiles", "iqm_interval")]
-            result.add_row(n, method, f"{row['median']:.3f}", pairs[0], f"{row['iqm']:.3f}", pairs[1])
-        result.add_section()
-    return result
-
-
 def picture(by_method: dict[str, Learner], sines: Sines, points: Memory, i: int, path: Path) -> None:
     """Draws the fits of sine ``i`` with three, four and five points."""
     figure = Figure(figsize=(9.6, 2.9), layout="constrained")
@@ -239,8 +209,8 @@ def picture(by_method: dict[str, Learner], sines: Sines, points: Memory, i: int,
     figure.savefig(path, dpi=120)
 
 
-def replicate(args: Args, seed: int) -> tuple[dict[str, NDArray[np.float64]], list[Result]]:
-    """One seed: the errors of each method, (3, test_sines), and the learners' settings."""
+def replicate(args: Args, seed: int) -> tuple[dict[str, Learner], dict[str, NDArray[np.float64]]]:
+    """Runs one seed: the learner of each method, and its errors, (3, test_sines)."""
     generator = torch.Generator().manual_seed(seed)
     by_method = learners(args, seed, generator)
     test = Sines.sample(args.test_sines, generator)
@@ -250,38 +220,62 @@ def replicate(args: Args, seed: int) -> tuple[dict[str, NDArray[np.float64]], li
         # The sine of the median ratio of the errors: neither method's showpiece.
         typical = int((errors["FAMLE"] / errors["MAML"])[1].argsort()[args.test_sines // 2])
         picture(by_method, test, points, typical, args.out / "sine.png")
-    settings = [
-        {"seed": seed, "method": method, "rates": asdict(learner.inner_loop), "meta_learning_seconds": learner.seconds}
-        for method, learner in by_method.items()
-    ]
-    return errors, settings
+    return by_method, errors
+
+
+def summary(errors: NDArray[np.float64]) -> Result:
+    """Computes statistics of the errors of one method with one number of points, (replicates, test_sines).
+
+    The interval is over the test sines, with the meta-trained models as they are.
+    """
+    low, median, high = np.percentile(errors, [25, 50, 75])
+    mean, *interval = interquartile_mean(errors.ravel())
+    return {
+        "median": float(median),
+        "quartiles": [float(low), float(high)],
+        "iqm": mean,
+        "iqm_interval": interval,
+        "iqm_per_replicate": [float(trim_mean(values, 0.25)) for values in errors],
+    }
 
 
 def main(args: Args) -> None:
-    """Runs all replicates, prints the table, and stores it with a picture of one test sine."""
+    """Runs all replicates, stores a row for each method and number of points, and a picture of one test sine."""
     torch.set_num_threads(1)
     start = time.perf_counter()
     args.out.mkdir(parents=True, exist_ok=True)
-    errors, settings = zip(*(replicate(args, seed) for seed in range(args.replicates)), strict=True)
-
-    statistics = {
-        method: {str(n): summary([by_method[method][i] for by_method in errors]) for i, n in enumerate(N_POINTS)}
-        for method in errors[0]
-    }
-    better = np.concatenate([by_method["FAMLE"] < by_method["MAML"] for by_method in errors], axis=1).mean(axis=1)
-    title = f"Mean squared error over x, {args.replicates} replicates of {args.test_sines} unseen sines"
-    Console().print(table(statistics, title))
-    result = {
-        "title": title,
-        "args": asdict(args) | {"out": str(args.out)},
+    runs = [replicate(args, seed) for seed in range(args.replicates)]
+    errors = {
+        method: np.stack([of[method] for _, of in runs], axis=1) for method in runs[0][1]
+    }  # (3, replicates, sines)
+    better = (errors["FAMLE"] < errors["MAML"]).mean(axis=(1, 2))
+    shared = {
+        "title": f"Mean squared error over x, {args.replicates} replicates of {args.test_sines} unseen sines",
         "seeds": list(range(args.replicates)),
-        "mean_squared_error": statistics,
-        "famle_better_than_maml": {str(n): float(share) for n, share in zip(N_POINTS, better, strict=True)},
-        "learners": [learner for of_seed in settings for learner in of_seed],
+        "args": asdict(args) | {"out": str(args.out)},
         "wall_seconds": time.perf_counter() - start,
-    }
-    write_json(args.out / "sine.json", result | provenance(sys.argv))
+    } | provenance(sys.argv)
+    rows = []
+    for method in errors:
+        used = [by_method[method] for by_method, _ in runs]
+        rates, seconds = [asdict(learner.inner_loop) for learner in used], [learner.seconds for learner in used]
+        about = {"rates": rates, "meta_learning_seconds": seconds, **shared}
+        for i, n in enumerate(N_POINTS):
+            row = {
+                "method": method,
+                "points": n,
+                **summary(errors[method][i]),
+                "famle_better_than_maml": float(better[i]),
+            }
+            rows.append(row | about)
+    store(args.out / "sine.csv", rows, keys=("method", "points"))
+    columns = ["points", "method", "median", "quartiles", "iqm", "iqm_interval"]
+    print(
+        shared["title"],
+        pd.DataFrame(rows)[columns].sort_values("points", kind="stable").to_string(index=False),
+        sep="\n",
+    )
 
 
 if __name__ == "__main__":
-    command.run(main, Args)
+    launch(main, Args)

@@ -1,4 +1,4 @@
-"""What a method is put to."""
+"""Test robots."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ import famle_envs  # noqa: F401 (registers the robots)
 from famle_agent.agents.presets import known_robots
 from famle_envs import Situation
 from famle_envs.profile import Profile
-
-__all__ = ["Task"]
 
 
 @dataclass(frozen=True)
@@ -46,6 +44,6 @@ class Task:
         return known_robots()[self.robot].env_id
 
     def make(self) -> gym.Env[Any, Any]:
-        """The test robot."""
+        """Makes the test robot."""
         kwargs: dict[str, Any] = {"profile": self.profile} if self.profile else {}
         return gym.make(self.env_id, situation=self.situation, **kwargs)

@@ -15,30 +15,33 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 
-from benchmarks import command, curves, gait_robots
-from benchmarks.compare import compare
-from benchmarks.harness import Options, Result, load_results
+from benchmarks import ant, curves, quadruped
 from benchmarks.methods import META_TRAINED, Method
-from benchmarks.reporting.registry import experiment_in
+from benchmarks.reporting.registry import experiment_named
+from benchmarks.results import Result, load
+from benchmarks.runner import Options, compare, launch
 from benchmarks.task import Task
 from famle_envs import Situation
-from famle_envs.ant import AntEnv
 from famle_envs.profile import Profile
 from famle_envs.quadruped import LEGS, blocked_leg
 from famle_envs.reacher import ReacherEnv
 
 YAW = math.radians(40)
+RobotName = Literal["reacher", "ant", "quadruped", "minitaur"]
+IN_EPISODES = ("reacher", "ant")
+"""Robots that go through one episode after the other."""
 
 
 @dataclass(frozen=True)
 class Args(Options):
     """One setting of an agent at several values, on robots that no result is of."""
 
-    robot: Literal["reacher", "ant", "quadruped", "minitaur"] = "quadruped"
+    robot: RobotName = "quadruped"
     """The robot."""
     methods: tuple[str, ...] = ("ampc-maml",)
     """Entries of benchmarks.methods.META_TRAINED."""
@@ -61,29 +64,27 @@ def main(args: Args) -> None:
         ReplicateError: A value failed, as one with which the learning diverges; the others are printed first.
         ValueError: The method is not meta-trained for the benchmark, or a value is not one of JSON.
     """
-    robot = ROBOTS[args.robot]
-    tasks = [robot.task(i, args.cache) for i in range(args.replicates)]
+    tasks = [ROBOTS[args.robot](i, args.cache) for i in range(args.replicates)]
     known = {
         f"{name}-{args.setting}={value}": method_with(name, args.setting, value)
         for name in args.methods
         for value in args.values
     }
-    folder = args.out / (f"{args.robot}-{args.steps}" if robot.lives else args.robot)
+    in_episodes = args.robot in IN_EPISODES
+    run = partial(_run_episodes, args=args, known=known) if in_episodes else partial(quadruped.run, known=known)
+    table = args.out / (f"{args.robot}-{args.steps}.csv" if in_episodes else f"{args.robot}.csv")
     try:
-        if robot.lives:
-            run, fleets = partial(_live_alone, args=args, known=known), partial(_live, args=args, known=known)
-            compare(list(known), tasks, run, folder, args, known, fleets)
-        else:
-            compare(list(known), tasks, partial(gait_robots.run, known=known), folder, args, known)
+        compare(list(known), tasks, run, table, args, known, together=in_episodes)
     finally:
-        results = load_results(folder) if folder.exists() else []
+        results = load(table) if table.exists() else pd.DataFrame(columns=["method"])
         for name in known:
-            if scores := [robot.score(result) for result in results if result["method"] == name][: args.replicates]:
-                print(f"{args.robot}, {name}: {np.mean(scores):.1f} of", *(f"{score:.1f}" for score in scores))
+            mine = results[results["method"] == name][: args.replicates]
+            if len(scores := mine.apply(score, axis="columns", robot=args.robot)):
+                print(f"{args.robot}, {name}: {scores.mean():.1f} of", *(f"{value:.1f}" for value in scores))
 
 
 def method_with(name: str, setting: str, value: str) -> Method:
-    """A method with one setting changed, and a model of its own.
+    """Makes a method with one setting changed, and a model of its own.
 
     Args:
         name: Of an agent that is meta-trained for the benchmark.
@@ -100,31 +101,20 @@ def method_with(name: str, setting: str, value: str) -> Method:
     return replace(recipe, name=f"{recipe.name}-{setting}={value}", settings=settings).method()
 
 
-def _live(method: str, tasks: Sequence[Task], args: Args, known: Mapping[str, Method]) -> list[Result]:
-    life = args.life(f"tuning-{args.robot}", method, [task.seed for task in tasks])
-    return curves.run(known[method].on(tasks), tasks, args.steps, life, minutes=args.minutes)
+def score(result: Mapping[str, Any], robot: RobotName) -> float:
+    """Computes what a replicate is judged by: its mean return, its gaits to the goal, or how far it walked."""
+    if robot in IN_EPISODES:
+        return float(np.mean(result["returns"]))
+    if robot == "minitaur":
+        return float(result["distance"])
+    return float(result["gaits"] if result["reached"] else experiment_named("quadruped-yaw").budget + 1)
 
 
-def _live_alone(method: str, task: Task, args: Args, known: Mapping[str, Method]) -> Result:
-    return _live(method, [task], args, known)[0]
+def _run_episodes(method: str, tasks: Sequence[Task], args: Args, known: Mapping[str, Method]) -> list[Result]:
+    return curves.run(known[method].on(tasks), tasks, args.steps, args.minutes)
 
 
 # --- the robots -------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Robot:
-    """Robots to tune on.
-
-    Attributes:
-        task: Makes robot i, of a folder of agents.
-        score: What a replicate is judged by.
-        lives: Whether it goes through episodes one after the other.
-    """
-
-    task: Callable[[int, Path], Task]
-    score: Callable[[Result], float]
-    lives: bool = False
 
 
 def _arm(i: int, cache: Path) -> Task:
@@ -132,7 +122,7 @@ def _arm(i: int, cache: Path) -> Task:
 
 
 def _ant(i: int, cache: Path) -> Task:
-    return Task("ant", i, AntEnv.sample_situation(np.random.default_rng([7, i])), cache)
+    return Task("ant", i, ant.damage_of("validation", i), cache)
 
 
 def _quadruped(i: int, cache: Path) -> Task:
@@ -182,26 +172,14 @@ def _minitaur(i: int, cache: Path) -> Task:
     return Task("minitaur", i, Situation(), cache, profile)
 
 
-def _mean_return(result: Result) -> float:
-    return float(np.mean(result["returns"]))
-
-
-def _gaits(result: Result) -> float:
-    return float(result["gaits"] if result["reached"] else experiment_in("quadruped-yaw").budget + 1)
-
-
-def _metres(result: Result) -> float:
-    return float(result["distance"])
-
-
-ROBOTS: Mapping[str, Robot] = {
-    "reacher": Robot(_arm, _mean_return, lives=True),
-    "ant": Robot(_ant, _mean_return, lives=True),
-    "quadruped": Robot(_quadruped, _gaits),
-    "minitaur": Robot(_minitaur, _metres),
+ROBOTS: Mapping[RobotName, Callable[[int, Path], Task]] = {
+    "reacher": _arm,
+    "ant": _ant,
+    "quadruped": _quadruped,
+    "minitaur": _minitaur,
 }
-"""By name."""
+"""Makes robot i by the robot's name, with a folder of agents."""
 
 
 if __name__ == "__main__":
-    command.run(main, Args)
+    launch(main, Args)

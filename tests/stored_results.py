@@ -3,38 +3,35 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks import results as tables
 from benchmarks.reporting.report import Report
 
 
-def store(results: Path, folder: str, method: str, seed: int, **figures: Any) -> Path:
+def store(results: Path, experiment: str, method: str, seed: int, **figures: Any) -> None:
     """Stores a replicate as a benchmark does."""
-    path = results / folder / f"{method}-{seed}.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
     source = {"command": f"python -m benchmarks.x --methods {method}", "commit": "abc1234"}
-    path.write_text(json.dumps({"method": method, "seed": seed, **source, **figures}))
-    return path
+    tables.store(results / f"{experiment}.csv", [{"method": method, "seed": seed, **source, **figures}])
 
 
 def store_curves(
-    results: Path, method: str, returns: Sequence[Sequence[float]], length: int = 50, folder: str = "reacher-paper"
+    results: Path, method: str, returns: Sequence[Sequence[float]], experiment: str = "reacher-paper", **more: Any
 ) -> None:
-    """Stores learning curves, one a seed."""
+    """Stores learning curves in episodes of 50 steps, one a seed."""
     for seed, values in enumerate(returns):
-        lengths = [length] * len(values)
-        store(results, folder, method, seed, returns=list(values), lengths=lengths, seconds_per_step=0.02)
+        curve = {"returns": list(values), "lengths": [50] * len(values), "seconds_per_step": 0.02}
+        store(results, experiment, method, seed, **curve, **more)
 
 
-def store_gaits(results: Path, method: str, gaits: Sequence[int | None], folder: str = "quadruped-yaw") -> None:
+def store_gaits(results: Path, method: str, gaits: Sequence[int | None], experiment: str = "quadruped-yaw") -> None:
     """Stores journeys to a goal, one a seed; None is one that did not get there."""
     for seed, n in enumerate(gaits):
         path = [[0.1 * i, 0.0] for i in range((n or 80) + 1)]
         reached = {"reached": n is not None, "fell": False, "distance": path[-1][0]}
-        store(results, folder, method, seed, gaits=n or 80, path=path, ms_per_plan=5.0, **reached)
+        store(results, experiment, method, seed, gaits=n or 80, path=path, ms_per_plan=5.0, **reached)
 
 
 def store_walks(results: Path, method: str, ways: Sequence[Sequence[float]]) -> None:
@@ -44,17 +41,19 @@ def store_walks(results: Path, method: str, ways: Sequence[Sequence[float]]) -> 
         store(results, "minitaur-held-out", method, seed, ms_per_plan=5.0, **figures)
 
 
-def store_runs(results: Path, method: str, returns: Sequence[float], folder: str = "ant-unseen") -> None:
+def store_runs(results: Path, method: str, returns: Sequence[float], experiment: str = "ant-unseen") -> None:
     """Stores first episodes with the same damage, one a seed."""
     for seed, value in enumerate(returns):
-        store_run(results, method, seed, value, folder=folder)
+        store_run(results, method, seed, value, experiment)
 
 
-def store_run(results: Path, method: str, seed: int, value: float, folder: str = "ant-unseen", **figures: Any) -> None:
+def store_run(
+    results: Path, method: str, seed: int, value: float, experiment: str = "ant-unseen", **figures: Any
+) -> None:
     """Stores one first episode."""
     milliseconds = {"mean": 13.0, "median": 12.0, "p99": 15.0}
     figures |= {"return": value, "speed": [value / 1000] * 20, "ms_per_step": milliseconds}
-    store(results, folder, method, seed, **figures)
+    store(results, experiment, method, seed, **figures)
 
 
 def report(results: Path) -> tuple[str, Path]:
@@ -64,13 +63,10 @@ def report(results: Path) -> tuple[str, Path]:
     return (out / "report.md").read_text(), out
 
 
-def read_csv(path: Path) -> list[dict[str, str]]:
-    with path.open() as file:
-        return list(csv.DictReader(file))
-
-
 def by_name(path: Path) -> dict[str, dict[str, str]]:
-    return {row["method"]: row for row in read_csv(path)}
+    """The rows of a table of figures by method."""
+    with path.open() as file:
+        return {row["method"]: row for row in csv.DictReader(file)}
 
 
 def rows_of(text: str, label: str) -> list[list[str]]:

@@ -44,7 +44,7 @@ def test_files_that_the_readme_names_are_there() -> None:
         assert path.exists(), name
         named.add(path.name)
         folder = path.parent
-    assert {"reacher.py", "planning.py", "lives.py", "NOTES.md"} <= named
+    assert {"reacher.py", "planning.py", "runner.py", "NOTES.md"} <= named
 
 
 @pytest.mark.parametrize(

@@ -1,1 +1,1 @@
-"""From stored results to tables, pictures and TensorBoard: ``python -m benchmarks.reporting``."""
+"""From stored results to tables and pictures: ``python -m benchmarks.reporting``."""

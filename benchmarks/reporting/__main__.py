@@ -1,7 +1,7 @@
 """``python -m benchmarks.reporting``: the report on all stored results."""
 
-from benchmarks import command
 from benchmarks.reporting.report import Report
+from benchmarks.runner import launch
 
 if __name__ == "__main__":
-    command.run(Report.__call__, Report)
+    launch(Report.__call__, Report)

@@ -1,317 +1,282 @@
-"""The report's text: a section an experiment."""
+"""The report's text: a table of all robots, and a section an experiment."""
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 
-import numpy as np
+import pandas as pd
+import yaml
 
-from benchmarks.reporting.looks import look
-from benchmarks.reporting.registry import Kind
+from benchmarks.reporting.figures import Row
+from benchmarks.reporting.registry import Kind, in_order, style_of
+from benchmarks.reporting.statistics import FEWEST
 from benchmarks.reporting.study import LAST, Study
-from benchmarks.reporting.tables import Row
-
-__all__ = ["document", "section"]
 
 _SIGNIFICANT = 0.05
 
-Column = tuple[str, Callable[[Row], str]]
-"""The heading of a column, and what it says of a row."""
+Cell = str | Callable[[Row], str]
+"""A template of figures, or a function of them; it is filled with a dash where a figure is not known."""
+
+_TEXTS: Mapping[str, str] = yaml.safe_load(Path(__file__).with_name("texts.yaml").read_text())
 
 
 def document(
-    sections: Sequence[str], missing: Sequence[tuple[str, str, str]], unknown: Sequence[str], times: Sequence[str]
+    sections: Sequence[str], missing: Sequence[tuple[str, str, str]], unknown: Sequence[str], times: bool
 ) -> str:
-    """The whole report.
+    """Writes the whole report.
 
     Args:
         sections: One an experiment.
-        missing: Experiments without results: title, where they would be, and the command.
-        unknown: Folders of results that are no entry of the registry.
-        times: Names of the files of pictures of returns against time.
+        missing: Experiments without results: title, the table where they would be, and the command.
+        unknown: Tables of results that are no entry of the registry.
+        times: Whether there is a picture of returns against time.
     """
-    parts = ["# Results", *_HOW_TO_READ, *sections]
+    parts = ["# Results", _TEXTS["report"], *sections]
     if times:
-        parts += [
-            "## Return against time",
-            *(f"![Return against the time of a control step]({name})" for name in times),
-            "Interquartile means; times in one run where there are any, else those of the replicates.",
-        ]
+        parts.append(_TEXTS["times"])
     if missing:
-        rows = "\n".join(f"| {title} | `{where}` | `{command}` |" for title, where, command in missing)
-        parts += ["## Not measured", f"| experiment | results | command |\n| --- | --- | --- |\n{rows}"]
+        rows = [(title, f"`{where}`", f"`{command}`") for title, where, command in missing]
+        parts += ["## Not measured", _table(("experiment", "results", "command"), rows)]
     if unknown:
         names = ", ".join(f"`{name}`" for name in unknown)
-        parts += [
-            "## Stored and not shown",
-            f"These folders have no entry in `benchmarks/reporting/registry.py`: {names}.",
-        ]
+        parts.append("## Stored and not shown")
+        parts.append(f"These tables have no entry in `benchmarks/reporting/experiments.yaml`: {names}.")
     return "\n\n".join(parts) + "\n"
 
 
-def section(study: Study, rows: Sequence[Row], pictures: Sequence[str]) -> str:
-    """The section of an experiment.
+def section(study: Study, figures: pd.DataFrame, pictures: Sequence[str]) -> str:
+    """Writes the section of an experiment.
 
     Args:
         study: Its replicates.
-        rows: Its figures.
+        figures: A row a method.
         pictures: Names of the files of its pictures, none where another section shows them.
     """
-    experiment = study.experiment
+    experiment, rows = study.experiment, _rows(figures)
     measured = [row for row in rows if row["replicates"]]
-    parts = [f"## {study.title}", *(f"![{experiment.title}]({picture})" for picture in pictures)]
-    columns = [*_COLUMNS[experiment.kind](study), *_diverged(rows), *_paper(study)]
-    parts.append(_table([_METHOD, _N, *columns], rows))
-    parts.append(_NOTES[experiment.kind].format(study=study))
-    parts.append(_table([_METHOD, _N, *_measures(study)], measured))
-    if compared := [row for row in measured if f"{study.measures[0].key}_famle_better" in row]:
-        parts += [_table([_METHOD, _N, *_improvements(study)], compared), _better_than_famle(study, compared)]
-    return "\n\n".join([*parts, _sources(study)])
-
-
-_HOW_TO_READ = (
-    """Made by `python -m benchmarks.reporting` from stored results alone. Robot steps are counted from the damage on.
-Spreads are medians with quartiles in round brackets; IQM is the interquartile mean with its bootstrap 95 % interval in
-square brackets.
-*Of the oracle* is the ratio of IQMs over the seeds that both have, turned over where fewer is better, so that 100 % is
-as good as the oracle; in brackets stands how many seeds that is, where a method has more. *P(FAMLE better)* is the
-probability that a replicate of FAMLE does better than one of the other method, a tie counted half, with its bootstrap
-95 % interval; that is Clopper and Pearson's where all comparisons go the same way. Fewer than five replicates have no
-interval and no p. Where each seed has a damage of its own, FAMLE is compared with the other method on the same damage
-alone, and it is the fraction of damages on which it does better; in round brackets stands how many they are, where a
-method has more. p is of Wilcoxon's signed-rank test there and of Mann and Whitney's elsewhere, adjusted for all
-comparisons of an experiment (Benjamini and Hochberg). Intervals and tests take replicates for independent also where
-they share networks: the ant, the quadruped and the Minitaur have one network of each method. Deviations are those of a
-sample (n - 1). An adaptation that *diverged* left the finite numbers and was taken back; older results did not count
-them.""",
-    """Times of replicates are wall times on machines that did other work too, and none are given of replicates that ran
-in step as one batch; those *in one run*, where methods took turns (`python -m benchmarks.step_time`), can be compared.
-The paper's figures for the quadruped and the Minitaur are of other bodies; they stand beside ours and not against
-them.""",
-)
-
-_NOTES: Mapping[Kind, str] = {
-    "curves": """Solved: three returns in a row above {study.experiment.threshold:g}, counted at the end of the first of
-them; a replicate that never gets there is infinite in the median. Methods are compared over the first {study.steps:,}
-robot steps, but for those of which the title says that they have fewer; *solved at*, *first crossing*, *matches FAMLE*
-(the first of three episodes in a row above FAMLE's median of its last five in these steps) and *its last* episodes are
-over all steps of a method. An episode is the resolution of all of these: where FAMLE is solved with the first one,
-*faster by* counts episodes. Returns are those of the life itself, PPO's with the noise by which it explores. The time
-of a step contains the simulated robot and all learning on the way; only in one run, that of the authors' settings is
-without their learning at the end of an episode.""",
-    "episode": """A robot walks again as soon as its mean speed over 100 steps is above 0.8 m/s, the paper's solved
-mark; the steps since the damage are a median, in which one that never does is infinite, and those of the slowest that
-does. Where the damage strikes on the way, one whose mean speed never falls to the mark walks on, after 0 steps. The
-time is the median of a control step, with adaptation.""",
-    "gaits": """Steps are the gaits of the runs that reach the goal, within {study.experiment.budget}. A gait takes a
-second; the paper's took about two. *FAMLE faster by* compares the means of these. The time of a plan is without
-adaptation.""",
-    "distance": """The largest distance and the seconds until then, medians over replicates of {study.experiment.budget}
-gaits, a second each; *FAMLE is there* when half of its replicates have come as far as the method's median. The time of
-a plan is without adaptation.""",
-}
-"""How the first table of each kind is to be read."""
-
-
-# --- columns ----------------------------------------------------------------------------------------------------------
-
-_METHOD: Column = ("method", lambda row: str(row["label"]))
-_N: Column = ("n", lambda row: str(row["replicates"] or "-"))
-
-
-def _curves(study: Study) -> list[Column]:
-    return [
-        ("robot steps", lambda row: _steps(row.get("robot_steps"))),
-        (f"solved in {study.steps:,}", lambda row: _count(row, "solved_in_common_steps")),
-        ("solved at all", lambda row: _count(row, "solved")),
-        ("solved at", lambda row: _steps(row.get("solved_at"))),
-        ("first crossing", lambda row: _steps(row.get("first_crossing"))),
-        ("FAMLE faster by", lambda row: _percent(row.get("famle_faster_by"))),
-        ("matches FAMLE", lambda row: _steps(row.get("famle_matched_at"))),
-        ("2nd episode", lambda row: _number(row.get("second_episode_median"))),
-        (f"its last {LAST}", lambda row: _spread(row, "end")),
-        *_times(study),
-    ]
-
-
-def _times(study: Study) -> list[Column]:
-    columns: list[Column] = [("ms / step", lambda row: _number(row.get("ms")))]
-    if study.step_times:
-        columns.append(("ms / step in one run (times the robot alone)", _together))
-    return columns
-
-
-def _episode(study: Study) -> list[Column]:
-    return [
-        (f"above {study.experiment.threshold:g}", lambda row: _count(row, "solved")),
-        ("walks on", lambda row: _count(row, "walks_on")),
-        ("walks again", lambda row: _count(row, "recovered")),
-        ("after steps", lambda row: _steps(row.get("recovery"))),
-        ("the slowest of them", lambda row: _steps(row.get("slowest_recovery"))),
-        *_times(study),
-    ]
-
-
-def _gaits(study: Study) -> list[Column]:
-    return [
-        ("steps, mean +- deviation", lambda row: _deviation(row, "steps")),
-        ("success rate", lambda row: _percent(row.get("success"))),
-        ("FAMLE faster by", lambda row: _percent(row.get("famle_faster_by"))),
-        ("ms / plan", lambda row: _number(row.get("ms"))),
-    ]
-
-
-def _distance(study: Study) -> list[Column]:
-    return [
-        ("max distance (m)", lambda row: _number(row.get("furthest_median"))),
-        ("interaction time (s)", lambda row: _steps(row.get("furthest_after_median"))),
-        ("FAMLE is there after (s)", lambda row: _steps(row.get("famle_there_after"))),
-        ("falls", lambda row: _count(row, "falls")),
-        ("ms / plan", lambda row: _number(row.get("ms"))),
-    ]
-
-
-_COLUMNS: Mapping[Kind, Callable[[Study], list[Column]]] = {
-    "curves": _curves,
-    "episode": _episode,
-    "gaits": _gaits,
-    "distance": _distance,
-}
-"""The first table of each kind, as the paper's."""
-
-
-def _diverged(rows: Sequence[Row]) -> list[Column]:
-    """Where anybody counted it."""
-    return [("adaptations that diverged", _share)] if any("diverged" in row for row in rows) else []
-
-
-def _paper(study: Study) -> list[Column]:
-    return [("the paper", lambda row: row.get("paper", "-"))] if study.experiment.paper else []
-
-
-def _measures(study: Study) -> list[Column]:
-    columns = list[Column]()
+    about = {"steps": study.steps, **vars(experiment)}
+    columns = [(title.format_map(about), cell) for title, cell in _COLUMNS[experiment.kind].items()]
+    columns += [("adaptations that diverged", _share), ("the paper", operator.itemgetter("paper"))]
+    spreads, improvements = list[tuple[str, Cell]](), list[tuple[str, Cell]]()
     for measure in study.measures:
-        key = measure.key
-        columns += [
-            (f"{measure.label}: median (quartiles)", partial(_spread, key=key)),
-            ("IQM [95 %]", partial(_interval, key=key)),
-        ]
-        if "oracle" in study.runs:
-            columns.append(("of the oracle", partial(_of_oracle, key=key)))
-    return columns
-
-
-def _improvements(study: Study) -> list[Column]:
-    return [(f"P(FAMLE better), {measure.label}", partial(_better, key=measure.key)) for measure in study.measures]
+        spreads.append((f"{measure.label}: median (quartiles)", partial(_spread, key=measure.key)))
+        spreads.append(("IQM [95 %]", partial(_interval, key=measure.key)))
+        spreads.append(("of the oracle", partial(_of_oracle, key=measure.key)))
+        improvements.append((f"P(FAMLE better), {measure.label}", partial(_better, key=measure.key)))
+    parts = [f"## {study.title}", *(f"![{experiment.title}]({picture})" for picture in pictures)]
+    parts += [_by_method(columns, rows), _TEXTS[experiment.kind].format_map(about), _by_method(spreads, measured)]
+    if compared := [row for row in measured if f"{study.measures[0].key}_famle_better" in row]:
+        parts += [_by_method(improvements, compared), _better_than_famle(study, compared)]
+    return "\n\n".join([*parts, _sources(study)])
 
 
 # --- cells ------------------------------------------------------------------------------------------------------------
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f}"
-
-
-def _steps(value: float | None) -> str:
-    if value is None:
+def _cell(row: Row, cell: Cell) -> str:
+    """Fills a cell with the figures of a method; with a dash where one is not known."""
+    try:
+        if callable(cell):
+            return cell(row)
+        return cell.format_map(row).replace("inf%", "never solved").replace("inf", "never").replace("%", " %")
+    except KeyError:
         return "-"
-    return "never" if np.isinf(value) else f"{value:,.0f}"
 
 
-def _percent(value: float | None) -> str:
-    if value is None:
-        return "-"
-    return "never solved" if np.isinf(value) else f"{100 * value:,.0f} %"
-
-
-def _count(row: Row, key: str) -> str:
-    return f"{row[key]} of {row['replicates']}" if key in row else "-"
-
-
-def _deviation(row: Row, key: str) -> str:
-    mean, deviation = row.get(f"{key}_mean"), row.get(f"{key}_deviation")
-    if mean is None:
-        return "-"
-    return f"{mean:.1f}" if deviation is None else f"{mean:.1f} +- {deviation:.1f}"
-
-
-def _share(row: Row) -> str:
-    if "diverged" not in row:
-        return "-"
-    often = row["diverged_replicates"]
-    return f"{100 * row['diverged']:.1f} %" + (f", over 10 % in {often} of {row['replicates']}" if often else "")
-
-
-def _together(row: Row) -> str:
-    return f"{row['step_ms']:.1f} (x {row['times_robot_alone']:.1f})" if "step_ms" in row else "-"
+def _rounded(row: Row, *names: str) -> list[str]:
+    """Writes figures with as many decimals as suit the first of them."""
+    decimals = 0 if abs(row[names[0]]) >= 100 else 1
+    return [f"{row[name]:.{decimals}f}" for name in names]
 
 
 def _spread(row: Row, key: str) -> str:
-    if f"{key}_median" not in row:
-        return "-"
-    return "{} ({} to {})".format(*(_decimals(row, key, name) for name in ("median", "low", "high")))
+    return "{} ({} to {})".format(*_rounded(row, f"{key}_median", f"{key}_low", f"{key}_high"))
 
 
 def _interval(row: Row, key: str) -> str:
-    if f"{key}_iqm" not in row:
-        return "-"
-    if f"{key}_iqm_low" not in row:
-        return _decimals(row, key, "iqm")
-    return "{} [{}, {}]".format(*(_decimals(row, key, name) for name in ("iqm", "iqm_low", "iqm_high")))
+    """As many decimals as the median has."""
+    names = [f"{key}_iqm_low", f"{key}_iqm_high"] if f"{key}_iqm_low" in row else []
+    _, mean, *bounds = _rounded(row, f"{key}_median", f"{key}_iqm", *names)
+    return mean + (f" [{', '.join(bounds)}]" if bounds else "")
 
 
 def _of_oracle(row: Row, key: str) -> str:
-    seeds = row.get(f"{key}_oracle_seeds")
-    return _percent(row.get(f"{key}_of_oracle")) + (f" ({seeds})" if seeds not in (None, row["replicates"]) else "")
+    return f"{100 * row[f'{key}_of_oracle']:,.0f} %" + _seeds(row, f"{key}_oracle_seeds")
 
 
 def _better(row: Row, key: str) -> str:
-    if f"{key}_famle_better" not in row:
-        return "-"
     name = f"{key}_famle_better"
-    cell, seeds = f"{row[name]:.2f}", row[f"{name}_seeds"]
+    cell = f"{row[name]:.2f}"
     if f"{name}_low" in row:
         cell += f" [{row[f'{name}_low']:.2f}, {row[f'{name}_high']:.2f}], p = {row[f'{name}_p']:.2g}"
-    return cell + (f" ({seeds})" if seeds != row["replicates"] else "")
+    return cell + _seeds(row, f"{name}_seeds")
 
 
-def _decimals(row: Row, key: str, name: str) -> str:
-    """A figure with as many decimals as the others of its cell."""
-    return f"{row[f'{key}_{name}']:.{0 if abs(row[f'{key}_median']) >= 100 else 1}f}"
+def _seeds(row: Row, name: str) -> str:
+    """Says of how many seeds a figure is, where a method has more."""
+    return f" ({row[name]:.0f})" if row[name] != row["replicates"] else ""
+
+
+def _deviation(row: Row) -> str:
+    return f"{row['steps_mean']:.1f}" + (f" +- {row['steps_deviation']:.1f}" if "steps_deviation" in row else "")
+
+
+def _share(row: Row) -> str:
+    share, often = f"{100 * row['diverged']:.1f} %", row["diverged_replicates"]
+    return share + (f", over 10 % in {often:.0f} of {row['replicates']}" if often else "")
+
+
+_TIMES: Mapping[str, Cell] = {
+    "ms / step": "{ms:.1f}",
+    "ms / step in one run (times the robot alone)": "{step_ms:.1f} (x {times_robot_alone:.1f})",
+}
+_COLUMNS: Mapping[Kind, Mapping[str, Cell]] = {
+    "curves": {
+        "robot steps": "{robot_steps:,.0f}",
+        "solved in {steps:,}": "{solved_in_common_steps:.0f} of {replicates}",
+        "solved at all": "{solved:.0f} of {replicates}",
+        "solved at": "{solved_at:,.0f}",
+        "first crossing": "{first_crossing:,.0f}",
+        "FAMLE faster by": "{famle_faster_by:,.0%}",
+        "matches FAMLE": "{famle_matched_at:,.0f}",
+        "2nd episode": "{second_episode_median:.1f}",
+        f"its last {LAST}": partial(_spread, key="end"),
+        **_TIMES,
+    },
+    "episode": {
+        "above {threshold:g}": "{solved:.0f} of {replicates}",
+        "walks on": "{walks_on:.0f} of {replicates}",
+        "walks again": "{recovered:.0f} of {replicates}",
+        "after steps": "{recovery:,.0f}",
+        "the slowest of them": "{slowest_recovery:,.0f}",
+        **_TIMES,
+    },
+    "gaits": {
+        "steps, mean +- deviation": _deviation,
+        "success rate": "{success:.0%}",
+        "FAMLE faster by": "{famle_faster_by:,.0%}",
+        "ms / plan": "{ms:.1f}",
+    },
+    "distance": {
+        "max distance (m)": "{furthest_median:.1f}",
+        "interaction time (s)": "{furthest_after_median:,.0f}",
+        "FAMLE is there after (s)": "{famle_there_after:,.0f}",
+        "falls": "{falls:.0f} of {replicates}",
+        "ms / plan": "{ms:.1f}",
+    },
+}
+"""The first table of each kind, as the paper's."""
 
 
 # --- parts ------------------------------------------------------------------------------------------------------------
 
 
-def _table(columns: Sequence[Column], rows: Sequence[Row]) -> str:
-    lines = [[title for title, _ in columns], ["---"] * len(columns)]
-    lines += [[cell(row) for _, cell in columns] for row in rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+def _rows(figures: pd.DataFrame) -> list[Row]:
+    """Lists the figures that are known, a row a method."""
+    return [dict(row.dropna()) for _, row in figures.astype(object).iterrows()]
+
+
+def _by_method(columns: Sequence[tuple[str, Cell]], rows: Sequence[Row]) -> str:
+    """Writes a table with a row a method, without columns of which nothing is known."""
+    filled = [[title, *(_cell(row, cell) for row in rows)] for title, cell in columns]
+    known = [column for column in filled if set(column[1:]) != {"-"}]
+    methods = ["method", *(row["label"] for row in rows)]
+    titles, *lines = zip(methods, ["n", *(str(row["replicates"] or "-") for row in rows)], *known, strict=True)
+    return _table(titles, lines)
+
+
+def _table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    return "\n".join(f"| {' | '.join(line)} |" for line in (titles, ["---"] * len(titles), *rows))
 
 
 def _better_than_famle(study: Study, rows: Sequence[Row]) -> str:
-    """Who wins against FAMLE in what, so that nobody has to search for it."""
+    """Says who wins against FAMLE in what, so that nobody has to search for it."""
     wins = []
     for measure in study.measures:
         name = f"{measure.key}_famle_better"
-        winners = [
-            row["label"] for row in rows if row.get(name, 1.0) < 0.5 and row.get(f"{name}_p", 1.0) < _SIGNIFICANT
-        ]
+        winners = [row["label"] for row in rows if row.get(name, 1) < 0.5 and row.get(f"{name}_p", 1) < _SIGNIFICANT]
         if winners:
             wins.append(f"{' / '.join(winners)} ({measure.label})")
     return f"Better than FAMLE, p < {_SIGNIFICANT}: {'; '.join(wins) or 'none'}."
 
 
 def _sources(study: Study) -> str:
-    """What runs the experiment, what is missing, and what made each of the results."""
-    experiment = study.experiment
-    parts = [f"`{experiment.command}` runs this.", experiment.shared]
-    if "oracle" not in study.runs:
+    """Says what runs the experiment, what is missing, and what made each of the results."""
+    parts = [f"`{study.experiment.command}` runs this.", study.experiment.shared]
+    if "oracle" not in study.methods:
         parts.append("No oracle has been measured here.")
     lines = [f"{' '.join(parts)} These results were made by:", ""]
     for (commit, command), methods in study.provenance.items():
-        names = ", ".join(look(method).label + f" (`{method}`)" for method in methods)
+        names = ", ".join(style_of(method).label + f" (`{method}`)" for method in methods)
         lines.append(f"- `{command}` at `{commit}`: {names}")
     return "\n".join(lines)
+
+
+# --- all robots in one table ------------------------------------------------------------------------------------------
+
+
+def _median(row: Row, key: str) -> str:
+    return _spread(row, key) if row["replicates"] >= FEWEST else _rounded(row, f"{key}_median")[0]
+
+
+def _solved(row: Row) -> str:
+    never = "{solved:.0f} of {replicates} in {robot_steps:,.0f}"
+    return (never if row["solved_at"] == float("inf") else "{solved_at:,.0f}").format_map(row)
+
+
+def _success(row: Row) -> str:
+    return f"{100 * row['success']:.0f} %" + (f", {_deviation(row)}" if "steps_mean" in row else "")
+
+
+_HEADLINE: Sequence[tuple[str, str, Callable[[Row], str]]] = (
+    ("reacher-paper", "arm: return of the first 50 steps", partial(_median, key="first_episode")),
+    ("reacher-paper", "arm: solved after robot steps", _solved),
+    ("ant-curves", "ant: return of the first 1,000 steps", partial(_median, key="first_episode")),
+    ("ant-curves", "ant: solved after robot steps", _solved),
+    ("quadruped-yaw", "quadruped, yaw error: success, gaits", _success),
+    ("quadruped-leg", "... a leg blocked", _success),
+    ("quadruped-both", "... both", _success),
+    ("minitaur-held-out", "Minitaur: metres in 60 gaits", partial(_median, key="distance")),
+)
+"""The experiment, the heading and the cell of each column; experiments without results have none."""
+
+
+def headline(figures: Mapping[str, pd.DataFrame]) -> str:
+    """Writes the table of all robots: a row a method, a column for what each experiment has measured.
+
+    Args:
+        figures: A row a method, by the name of the experiment.
+    """
+    columns = [column for column in _HEADLINE if column[0] in figures]
+    rows = {name: dict(zip(figures[name].index, _rows(figures[name]), strict=True)) for name, *_ in columns}
+    measured = {method for table in rows.values() for method in table}
+    methods = [method for method in in_order(measured) if style_of(method).headline]
+    lines = []
+    for method in methods:
+        cells = (cell(rows[name][method]) if method in rows[name] else "" for name, _, cell in columns)
+        lines.append([style_of(method).label, *cells])
+    counts = []
+    for name, table in rows.items():
+        n = sorted({table[method]["replicates"] for method in methods if method in table})
+        counts.append(f"{n[0]} to {n[-1]} ({name})" if len(n) > 1 else f"{n[0]} ({name})")
+    return _table(["method", *(title for _, title, _ in columns)], lines) + f"\n\nReplicates: {', '.join(counts)}."
+
+
+def sine_section(title: str, stored: pd.DataFrame) -> str:
+    """Writes the section of the paper's figure 2, which has no robot.
+
+    Args:
+        title: Of the section.
+        stored: A row for each method and number of points.
+    """
+    errors = {(row["points"], row["method"]): row for row in stored.to_dict("records")}
+    methods, spread = stored["method"].unique(), "{median:.3f} ({quartiles[0]:.3f} to {quartiles[1]:.3f})"
+    rows = []
+    for points in stored["points"].unique():
+        better = f"{100 * errors[points, 'FAMLE']['famle_better_than_maml']:.0f} %"
+        rows.append([str(points), *(spread.format_map(errors[points, method]) for method in methods), better])
+    about = {**stored.iloc[0], "table": _table(["points", *methods, "FAMLE better than MAML"], rows)}
+    return f"## {title}\n\n{_TEXTS['sine'].format_map(about)}"

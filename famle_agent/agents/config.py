@@ -62,6 +62,11 @@ class Simulation:
     episode_length: int = 0
     rounds: Rounds | None = None
 
+    @property
+    def planned(self) -> int:
+        """Transitions of each situation in all rounds of planning together."""
+        return self.rounds.number * self.rounds.transitions if self.rounds else 0
+
     def transitions(self, number: int) -> int:
         """Transitions of each situation in a round, counted from 0."""
         return self.rounds.transitions if self.rounds and number else self.transitions_per_situation
@@ -156,7 +161,8 @@ class Config:
     def learnt_otherwise(self, other: Config) -> list[str]:
         """Names the settings by which a model that was meta-learned with these differs from what the others give."""
         ours, theirs = self.to_dict(), other.to_dict()
-        names = [name for name in _HINTS if name not in _ONLINE and (name in ours or name in theirs)]
+        learning = (name for name in _HINTS if name not in _ONLINE | _SEEN_IN_DIMS)
+        names = [name for name in learning if name in ours or name in theirs]
         return [name for name in names if ours.get(name) != theirs.get(name)]
 
     # --- the rounds of meta-training --------------------------------------------------------------------
@@ -354,6 +360,9 @@ _ONLINE = {
     *("planner", "planning_reward"),
 }
 """Settings of the life on a robot; rounds in simulation plan too, but a model may be used with another planner."""
+
+_SEEN_IN_DIMS = {"egocentric", "raw_angles"}
+"""Settings by which models differ where their dimensions do, which are compared by themselves."""
 
 _UNUSED = "adapt_decay"
 """A setting of version 0.1 that is 0 in its files."""

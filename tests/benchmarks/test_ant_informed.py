@@ -10,8 +10,9 @@ from benchmarks import ant_informed
 from benchmarks.methods import shipped
 from benchmarks.task import Task
 from famle_agent import FAMLE
-from famle_agent.agents.config import Hyperparameters
+from famle_agent.agents.config import Config
 from famle_agent.training.multitask import JointTraining
+from famle_agent.training.trainer import MetaTrainer
 from famle_envs import Situation
 
 BROKEN = Situation(motor_gain=(1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0), orientation_error=1.0)
@@ -32,7 +33,8 @@ def collected(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     monkeypatch.setattr(ant_informed, "collect", watch)
     monkeypatch.setattr(ant_informed, "simulated_data", lambda task: others)
     monkeypatch.setattr(ant_informed, "_IDENTIFIES", 40)
-    monkeypatch.setattr(Hyperparameters, "joint_training", lambda self, number: JointTraining(40, 1e-3, 0.03, 512))
+    few = MetaTrainer(JointTraining(40, 1e-3, 0.03, 512), None, None)
+    monkeypatch.setattr(Config, "trainer", lambda self, number, last: few)
     return seen
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,13 +11,15 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from benchmarks import curves, methods, reacher
+from benchmarks import curves, methods
+from benchmarks.ant import ANT_METHODS
 from benchmarks.methods import META_TRAINED, METHODS, ORIGINAL_CANDIDATES, PPO_METHODS, MetaTrained, about
-from benchmarks.reporting.registry import experiment_in
+from benchmarks.reporting.registry import EXPERIMENTS, experiment_named
 from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent
-from famle_agent.agents import simulation
+from famle_agent.agents import meta_training
 from famle_agent.agents.presets import known_robots
 from famle_agent.training.progress import Progress
+from famle_agent.training.trainer import MetaTrainer, Metrics
 from tests.small_reacher import EPISODE, REDUCED, task_of
 
 pytestmark = pytest.mark.usefixtures("small_reacher")
@@ -104,15 +107,15 @@ def test_every_method_makes_an_agent_that_lives_on_the_robot(method: str, cache:
 def test_methods_differ_by_their_settings(method: str, expected: dict[str, Any], cache: Path) -> None:
     agent = METHODS[method].agent(task_of(1, cache))
     assert isinstance(agent, ModelBasedAgent)
-    settings = agent.hyperparameters
-    assert {name: getattr(settings, name) for name in expected} == expected
-    assert settings.members == agent.model.members == 1
+    settings = agent.config.to_dict()
+    assert {name: settings[name] for name in expected} == expected
+    assert settings["members"] == agent.model.members == 1
     agent.get_env().close()
 
 
 def test_results_tell_settings_apart(cache: Path) -> None:
     one, same, other, rival, model_free = (
-        about(METHODS[method].agent(task_of(seed, cache)))["settings"]
+        about(METHODS[method].agent(task_of(seed, cache))).get("settings")
         for method, seed in (("famle", 0), ("famle", 1), ("famle-frozen", 0), ("ampc", 0), ("ppo", 0))
     )
     assert one == same
@@ -123,7 +126,8 @@ def test_results_tell_settings_apart(cache: Path) -> None:
 
 
 def test_every_benchmark_knows_its_methods() -> None:
-    assert {*reacher.MODEL_BASED, *PPO_METHODS, "famle-frozen", "oracle"} <= set(METHODS)
+    assert {name for one in EXPERIMENTS for name in one.methods if one.robot != "ant"} <= set(METHODS)
+    assert {name for one in EXPERIMENTS for name in one.methods} <= {*METHODS, *ANT_METHODS}
     assert {name for name, method in METHODS.items() if method.fleet is not None} == set(IN_STEP)
 
 
@@ -149,7 +153,7 @@ def test_cached_model_outlasts_all_settings_but_those_of_its_learning(
             monkeypatch.setitem(settings, name, value)
     agent: Any = METHODS[method].agent(task_of(0, tmp_path))
     assert bool(watched) == again
-    assert agent.hyperparameters.to_dict().items() >= changed.items()
+    assert agent.config.to_dict().items() >= changed.items()
     METHODS[method].agent(task_of(0, tmp_path))
     assert len(watched) == again
 
@@ -172,7 +176,7 @@ def test_replicates_take_turns_with_the_networks_of_one_ensemble(
     ensemble: Any = recipe.learn(task_of(0, tmp_path))
     assert ensemble.dynamics.members == 3
     for agent, seed in zip(agents, (0, 1, 2, 4), strict=True):
-        assert agent.dynamics.members == agent.hyperparameters.members == 1
+        assert agent.dynamics.members == agent.config.model.members == 1
         assert agent.seed == seed
         assert agent.situations == ensemble.situations
         for name, value in ensemble.dynamics.theta.items():
@@ -206,22 +210,23 @@ def test_rivals_learn_from_the_same_transitions(monkeypatch: pytest.MonkeyPatch,
 
 
 def test_stopped_meta_training_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(simulation, "Progress", partial(Progress, every=0.0))
+    monkeypatch.setattr(meta_training, "Progress", partial(Progress, every=0.0))
     recipe, task = MetaTrained("paper", FAMLE, "paper"), task_of(0, tmp_path / "stopped")
     whole = recipe.learn(task_of(0, tmp_path / "whole"))
-    log, iterations = ModelBasedAgent.log_iteration, list[int]()
+    fit, iterations = MetaTrainer.fit, list[int]()
 
-    def log_iteration(self: ModelBasedAgent, *args: Any) -> bool:
-        iterations.append(self.num_timesteps)
-        if iterations == [0, 1]:
-            raise KeyboardInterrupt
-        return log(self, *args)
+    def stops(self: MetaTrainer, *args: Any) -> Iterator[Metrics]:
+        for metrics in fit(self, *args):
+            iterations.append(1)
+            yield metrics
+            if len(iterations) == 2:
+                raise KeyboardInterrupt
 
-    monkeypatch.setattr(ModelBasedAgent, "log_iteration", log_iteration)
+    monkeypatch.setattr(MetaTrainer, "fit", stops)
     with pytest.raises(KeyboardInterrupt):
         recipe.learn(task)
     assert torch.equal(network_of(recipe.learn(task)), network_of(whole))
-    assert iterations == [0, 1, 1]
+    assert len(iterations) == 3  # the first is not done again
     assert [path.name for path in task.cache.iterdir()] == ["reacher-paper.zip"]
 
 
@@ -242,7 +247,7 @@ def test_robots_in_step_have_the_networks_of_their_replicates(method: str, cache
     fleet.set_env(DummyVecEnv([task.make for task in tasks]))
     fleet.learn(2)
     assert torch.equal(network_of(fleet), expected)  # one step a robot: too early to adapt
-    fleet.learn(2 * max(1, fleet.hyperparameters.adapt_every - 1))
+    fleet.learn(2 * max(1, fleet.config.adaptation.every - 1))
     assert fleet.belief.adaptations == 1
     moved = (network_of(fleet) - expected).abs().amax(dim=1)
     assert (moved > 0).all()
@@ -263,9 +268,9 @@ def test_results_say_how_adaptations_went(cache: Path) -> None:
 
 def test_network_may_be_learnt_with_another_planner_than_it_is_used_with(tmp_path: Path) -> None:
     recipe = MetaTrained("planned", FAMLE, "paper", simulation={"candidates": 3})
-    assert recipe.learn(task_of(0, tmp_path)).hyperparameters.candidates == 3
-    assert recipe.agent(task_of(0, tmp_path)).hyperparameters.candidates == REDUCED["candidates"]
+    assert recipe.learn(task_of(0, tmp_path)).config.planner.candidates == 3
+    assert recipe.agent(task_of(0, tmp_path)).config.planner.candidates == REDUCED["candidates"]
 
 
 def test_title_says_what_the_planned_data_of_the_authors_settings_were_planned_with() -> None:
-    assert f"planned data with {ORIGINAL_CANDIDATES} sequences" in experiment_in("ant-curves").title
+    assert f"planned data with {ORIGINAL_CANDIDATES} sequences" in experiment_named("ant-curves").title

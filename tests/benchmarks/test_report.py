@@ -1,20 +1,21 @@
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks.reporting.looks import LOOKS, in_order, look
-from benchmarks.reporting.registry import EXPERIMENTS, Experiment, Published
+from benchmarks import results as tables
+from benchmarks.reporting.registry import EXPERIMENTS, STYLES, Experiment, in_order, style_of
 from benchmarks.reporting.report import Report, show
 from benchmarks.reporting.statistics import p_value
+from benchmarks.results import load
 from tests.stored_results import (
     by_name,
-    read_csv,
     report,
     rows_of,
+    store,
     store_curves,
     store_gaits,
     store_run,
@@ -71,7 +72,7 @@ def test_report_has_a_section_a_picture_and_a_table_for_every_experiment_that_is
         assert (out / f"{name}.png").read_bytes().startswith(PNG)
         assert f"]({name}.png)" in text
     assert {path.stem for path in out.glob("*.csv")} == {
-        *("reacher-paper", "ant-unseen", "quadruped-yaw", "minitaur-held-out", "replicates")
+        *("reacher-paper", "ant-unseen", "quadruped-yaw", "minitaur-held-out")
     }
     assert text.count("\n## Arm, the paper's damage") == 1
     assert "- `python -m benchmarks.x --methods famle` at `abc1234`: FAMLE (`famle`)" in text
@@ -87,8 +88,8 @@ def test_experiments_without_results_are_named_as_not_measured(arm: Path) -> Non
     assert "figure 4" not in shown
 
 
-def test_folders_that_no_experiment_knows_are_named(ant: Path) -> None:
-    store_runs(ant, "famle", [1.0], folder="ant-moon")
+def test_tables_that_no_experiment_knows_are_named(ant: Path) -> None:
+    store_runs(ant, "famle", [1.0], experiment="ant-moon")
     assert "`ant-moon`" in report(ant)[0].split("## Stored and not shown")[1]
 
 
@@ -99,7 +100,7 @@ def test_figures_of_curves_are_those_of_the_replicates(arm: Path) -> None:
     assert float(row["mean_return_median"]) == pytest.approx((31.25 + 35.0) / 2)
     assert float(row["first_episode_of_oracle"]) == pytest.approx(27.5 / 40.0, abs=1e-4)
     assert float(row["solved_at"]) == 75.0
-    assert row["solved_in_common_steps"] == "2"
+    assert float(row["solved_in_common_steps"]) == 2
     assert float(row["ms"]) == 20.0
     assert rows_of(text, "FAMLE")[0][-1] == "solved at about 500 steps"
 
@@ -109,11 +110,11 @@ def test_curves_are_compared_over_the_steps_that_all_have_and_long_budgets_are_t
     text, out = report(arm)
     rows = by_name(out / "reacher-paper.csv")
     assert float(rows["ppo"]["mean_return_median"]) == 0.0
-    assert (rows["ppo"]["solved_in_common_steps"], rows["ppo"]["solved"]) == ("0", "2")
+    assert [float(rows["ppo"][name]) for name in ("solved_in_common_steps", "solved")] == [0, 2]
     assert (rows["ppo"]["robot_steps"], rows["famle"]["robot_steps"]) == ("1000", "200")
     assert float(rows["ppo"]["solved_at"]) == 550.0
     assert float(rows["ppo"]["famle_matched_at"]) == 550.0  # the first of three above the mean of 20, 35, 35 and 35
-    assert (rows["famle"]["famle_matched_at"], rows["oracle"]["famle_matched_at"]) == ("", "50.0")
+    assert (rows["famle"]["famle_matched_at"], rows["oracle"]["famle_matched_at"]) == ("", "50")
     assert (float(rows["ppo"]["end_median"]), float(rows["famle"]["end_median"])) == (50.0, (31.25 + 35.0) / 2)
     assert float(rows["ppo"]["famle_faster_by"]) == pytest.approx(550.0 / 75.0 - 1.0, abs=1e-4)
     assert "mean return over 200 robot steps" in text
@@ -126,11 +127,8 @@ def test_method_with_fewer_steps_is_compared_by_what_it_has(arm: Path) -> None:
     store_curves(arm, "ampc", [[10.0]] * 2)
     text, out = report(arm)
     row = by_name(out / "reacher-paper.csv")["famle-paper"]
-    assert (row["robot_steps"], row["first_episode_median"], row["first_episode_famle_better"]) == (
-        "100",
-        "10.0",
-        "1.0",
-    )
+    figures = ("robot_steps", "first_episode_median", "first_episode_famle_better")
+    assert [float(row[name]) for name in figures] == [100, 10, 1]
     compared = ("mean_return_median", "last_median", "mean_return_famle_better", "solved_in_common_steps")
     assert [row[name] for name in compared] == [""] * 4
     alike = "100 robot steps of FAMLE, the paper's settings / FAMLE, the authors' code's settings"
@@ -140,19 +138,17 @@ def test_method_with_fewer_steps_is_compared_by_what_it_has(arm: Path) -> None:
 
 def test_episode_says_which_robots_walk_again(ant: Path) -> None:
     for seed, steps in enumerate((0, 100, 300, None)):
-        path = ant / "ant-unseen" / f"famle-{seed}.json"
-        stored = json.loads((ant / "ant-unseen" / "famle-0.json").read_text())
-        path.write_text(json.dumps(stored | {"seed": seed, "recovery": steps, "break_at": 300}))
+        store_run(ant, "famle", seed, 2000.0, recovery=steps, break_at=300)
     text, out = report(ant)
     row = by_name(out / "ant-unseen.csv")["famle"]
     walking = ("walks_on", "recovered", "recovery", "slowest_recovery")
-    assert [row[name] for name in walking] == ["1", "3", "200.0", "300"]
+    assert [float(row[name]) for name in walking] == [1, 3, 200, 300]
     assert rows_of(text, "FAMLE")[0][3:7] == ["1 of 4", "3 of 4", "200", "300"]
 
 
 def test_robot_that_was_broken_from_the_first_step_does_not_walk_on(ant: Path) -> None:
     text, _ = report(ant)
-    assert rows_of(text, "FAMLE")[0][3] == "-"
+    assert "| walks on |" not in text
 
 
 def test_benchmark_shows_the_section_of_its_experiment(ant: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -162,7 +158,7 @@ def test_benchmark_shows_the_section_of_its_experiment(ant: Path, capsys: pytest
     assert "2200" in shown  # the median of FAMLE
     with pytest.raises(FileNotFoundError, match="run the benchmark first"):
         show(ant, "reacher-paper")
-    with pytest.raises(ValueError, match=r"ant-moon.*registry\.py"):
+    with pytest.raises(ValueError, match=r"ant-moon.*experiments\.yaml"):
         show(ant, "ant-moon")
 
 
@@ -178,7 +174,6 @@ def test_success_rate_and_gaits_stand_beside_the_paper_s(quadruped: Path) -> Non
     rows = by_name(out / "quadruped-yaw.csv")
     assert float(rows["ampc-reptile"]["gaits_median"]) == (40 + 81) / 2
     assert float(rows["ampc-reptile"]["gaits_famle_better"]) == 1.0
-    assert float(rows["famle"]["paper_steps_mean"]) == 32.6
 
 
 def test_distance_is_the_furthest_and_the_time_until_there(minitaur: Path) -> None:
@@ -234,19 +229,17 @@ def test_many_comparisons_are_corrected_for(arm: Path) -> None:
 
 
 def first_returns(results: Path, method: str) -> list[float]:
-    files = sorted((results / "reacher-paper").glob(f"{method}-[0-9]*.json"))
-    return [json.loads(path.read_text())["returns"][0] for path in files]
+    table = load(results / "reacher-paper.csv")
+    return [returns[0] for returns in table["returns"][table["method"] == method]]
 
 
 def test_replicates_whose_adaptations_diverge_are_marked(arm: Path) -> None:
-    path = arm / "reacher-paper" / "famle-0.json"
-    stored = json.loads(path.read_text())
-    path.write_text(json.dumps(stored | {"adaptations": 20, "diverged": 3}))
-    other = path.with_name("famle-1.json")
-    other.write_text(json.dumps(json.loads(other.read_text()) | {"adaptations": 20, "diverged": 2}))
+    curve = {"returns": [20.0, 35.0, 35.0, 35.0], "lengths": [50] * 4, "seconds_per_step": 0.02}
+    for seed, diverged in enumerate((3, 2)):
+        store(arm, "reacher-paper", "famle", seed, **curve, adaptations=20, diverged=diverged)
     text, out = report(arm)
     row = by_name(out / "reacher-paper.csv")["famle"]
-    assert (float(row["diverged"]), row["diverged_replicates"]) == (0.125, "1")
+    assert (float(row["diverged"]), float(row["diverged_replicates"])) == (0.125, 1)
     title = next(line for line in text.splitlines() if line.startswith("## Arm"))
     assert "more than one in ten adaptations diverged in 1 replicates of FAMLE" in title
     assert any("12.5 %, over 10 % in 1 of 2" in cell for cell in rows_of(text, "FAMLE")[0])
@@ -287,7 +280,7 @@ def test_unknown_method_is_shown_under_its_own_name_after_the_known_ones(arm: Pa
     text, out = report(arm)
     assert rows_of(text, "magic")
     assert list(by_name(out / "reacher-paper.csv"))[:3] == ["famle", "oracle", "magic"]
-    assert look("magic").label == "magic"
+    assert style_of("magic").label == "magic"
     assert in_order(["magic", "oracle", "famle"]) == ["famle", "oracle", "magic"]
 
 
@@ -310,22 +303,8 @@ def test_oracle_is_compared_over_the_seeds_that_both_have(ant: Path) -> None:
     store_runs(ant, "oracle", [4000.0])
     text, out = report(ant)
     row = by_name(out / "ant-unseen.csv")["famle"]
-    assert (float(row["return_of_oracle"]), row["return_oracle_seeds"]) == (0.5, "1")
+    assert (float(row["return_of_oracle"]), float(row["return_oracle_seeds"])) == (0.5, 1)
     assert any(row[-1] == "50 % (1)" for row in rows_of(text, "FAMLE"))
-
-
-def test_tidy_table_has_a_row_a_replicate_and_of_curves_a_row_an_episode(
-    results: Path, arm: Path, quadruped: Path
-) -> None:
-    rows = read_csv(report(results)[1] / "replicates.csv")
-    curves = [row for row in rows if (row["experiment"], row["method"]) == ("reacher-paper", "famle")]
-    assert [(row["seed"], row["episode"], row["robot_steps"]) for row in curves[:2]] == [
-        ("0", "1", "50"),
-        ("0", "2", "100"),
-    ]
-    assert len(curves) == 8
-    gaits = [row for row in rows if (row["experiment"], row["method"]) == ("quadruped-yaw", "ampc-reptile")]
-    assert [(row["gaits"], row["reached"]) for row in gaits] == [("40", "True"), ("80", "False")]
 
 
 def test_without_results_the_remedy_is_named_and_nothing_is_written(tmp_path: Path) -> None:
@@ -334,20 +313,50 @@ def test_without_results_the_remedy_is_named_and_nothing_is_written(tmp_path: Pa
     assert not (tmp_path / "report").exists()
 
 
-@pytest.mark.parametrize(
-    "content", ["", '{"method": "famle", "se', "[1, 2]", '{"method": "famle", "seed": 0, "command": "", "commit": ""}']
-)
-def test_damaged_result_is_named_with_a_remedy_and_nothing_is_written(arm: Path, content: str) -> None:
-    (arm / "reacher-paper" / "famle-1.json").write_text(content)
-    with pytest.raises(ValueError, match=r"famle-1\.json is damaged .*delete the file and run the benchmark again"):
+@pytest.mark.parametrize("figures", [{}, {"returns": []}, {"returns": [1.0], "lengths": [50], "command": None}])
+def test_row_without_what_its_experiment_needs_is_named_and_nothing_is_written(arm: Path, figures: Any) -> None:
+    tables.store(arm / "reacher-paper.csv", [{"method": "ampc", "seed": 0, "commit": "abc1234", **figures}])
+    with pytest.raises(ValueError, match=r"reacher-paper\.csv is damaged \(a row has no .*delete that row and run"):
         report(arm)
     assert not (arm.parent / "report").exists()
 
 
-def test_replicate_without_a_whole_episode_is_refused(arm: Path) -> None:
-    store_curves(arm, "ampc", [[]])
-    with pytest.raises(ValueError, match=r"ampc-0\.json is damaged \(it has no returns, lengths\)"):
-        report(arm)
+# --- sines, which have no robot -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def sines(arm: Path) -> Path:
+    """Results of an arm and of sines."""
+    source = {"command": "python -m benchmarks.sine --replicates 2", "commit": "abc1234", "title": "Errors"}
+    better = {3: 0.8, 5: 0.755}
+    rows = [
+        {
+            "method": method,
+            "points": n,
+            "median": x,
+            "quartiles": [0.5 * x, 2.0 * x],
+            "famle_better_than_maml": better[n],
+        }
+        for method, x in (("FAMLE", 0.04), ("MAML", 0.2))
+        for n in better
+    ]
+    tables.store(arm / "sine.csv", [row | source for row in rows], keys=("method", "points"))
+    (arm / "sine.png").write_bytes(b"a picture")
+    return arm
+
+
+def test_sines_have_a_section_with_the_stored_figures_and_the_picture(sines: Path) -> None:
+    text, out = report(sines)
+    assert "\n## Sines from three, four and five points (figure 2)\n" in text
+    assert rows_of(text, "3") == [["3", "0.040 (0.020 to 0.080)", "0.200 (0.100 to 0.400)", "80 %"]]
+    assert rows_of(text, "5")[0][-1] == "76 %"
+    assert "`python -m benchmarks.sine --replicates 2` at `abc1234`" in text
+    assert (out / "sine.png").read_bytes() == b"a picture"
+    assert "| `sine` |" not in text
+
+
+def test_sines_that_were_not_measured_are_named_so(arm: Path) -> None:
+    assert "| `sine` | `python -m benchmarks.sine` |" in report(arm)[0].split("## Not measured")[1]
 
 
 def test_report_is_the_same_the_second_time(quadruped: Path) -> None:
@@ -357,11 +366,10 @@ def test_report_is_the_same_the_second_time(quadruped: Path) -> None:
     assert tables == {path.name: path.read_bytes() for path in out.glob("*.csv")}
 
 
-def test_registry_names_every_experiment_once_and_the_paper_s_methods_as_the_looks_do() -> None:
-    assert len({experiment.folder for experiment in EXPERIMENTS}) == len(EXPERIMENTS)
-    stands_beside = {look.paper for look in LOOKS.values()}
+def test_registry_names_every_experiment_once_and_the_paper_s_methods_as_the_styles_do() -> None:
+    assert len({experiment.name for experiment in EXPERIMENTS}) == len(EXPERIMENTS)
+    stands_beside = {style.paper for style in STYLES.values()}
     assert {row.method for experiment in EXPERIMENTS for row in experiment.paper} <= stands_beside
-    assert str(Published("FAMLE", distance=4.8, time=60.0)) == "4.8 m in 60 s"
 
 
 def test_curves_cannot_share_a_picture() -> None:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+from benchmarks.results import load
 from benchmarks.sine import N_POINTS, Args, Sines, first, main
 
 TINY: dict[str, Any] = {
@@ -28,25 +28,24 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_stores_picture_and_statistics(folder: Path) -> None:
-    result = json.loads((folder / "sine.json").read_text())
-    assert {"title", "args", "seeds", "learners", "wall_seconds", "command", "commit", "versions"} <= set(result)
-    assert result["seeds"] == [0, 1]
-    assert set(result["mean_squared_error"]) == {"FAMLE", "MAML", "selection only"}
-    for by_points in result["mean_squared_error"].values():
-        assert list(by_points) == ["3", "4", "5"]
-        for statistics in by_points.values():
-            assert statistics["quartiles"][0] <= statistics["median"] <= statistics["quartiles"][1]
-            assert statistics["iqm_interval"][0] <= statistics["iqm"] <= statistics["iqm_interval"][1]
-            assert len(statistics["iqm_per_replicate"]) == 2
+    table = load(folder / "sine.csv")
+    assert {"title", "args", "rates", "wall_seconds", "command", "commit", "versions"} <= set(table)
+    assert set(table["method"]) == {"FAMLE", "MAML", "selection only"}
+    for row in table.to_dict("records"):
+        assert row["points"] in N_POINTS
+        assert row["seeds"] == [0, 1]
+        assert row["quartiles"][0] <= row["median"] <= row["quartiles"][1]
+        assert row["iqm_interval"][0] <= row["iqm"] <= row["iqm_interval"][1]
+        assert len(row["iqm_per_replicate"]) == len(row["meta_learning_seconds"]) == 2
     assert (folder / "sine.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "sine.png").stat().st_size < 150_000
 
 
 def test_same_seeds_same_numbers(folder: Path, tmp_path: Path) -> None:
     main(Args(**TINY, out=tmp_path))
-    one, other = (json.loads((path / "sine.json").read_text()) for path in (folder, tmp_path))
-    for key in ("mean_squared_error", "famle_better_than_maml"):
-        assert one[key] == other[key]
+    one, other = (load(path / "sine.csv") for path in (folder, tmp_path))
+    figures = ["method", "points", "median", "quartiles", "iqm_per_replicate", "famle_better_than_maml", "rates"]
+    assert one[figures].equals(other[figures])
 
 
 def test_points_lie_on_their_sine() -> None:

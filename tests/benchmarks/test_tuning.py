@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from benchmarks import tuning
-from benchmarks.harness import load_results
-from benchmarks.tuning import ROBOTS, Args, method_with
+from benchmarks.results import load
+from benchmarks.tuning import ROBOTS, Args, RobotName, method_with, score
 from famle_agent import ModelBasedAgent
 from famle_envs.profile import Profile
 from tests.small_reacher import EPISODE, task_of
@@ -25,10 +25,9 @@ def test_values_of_a_setting_are_compared_on_the_same_robots(
         jobs=1,
         out=tmp_path / "out",
         cache=tmp_path / "cache",
-        lives=tmp_path / "lives",
     )
     tuning.main(args)
-    results = load_results(tmp_path / "out" / f"reacher-{EPISODE}")
+    results = load(tmp_path / "out" / f"reacher-{EPISODE}.csv").to_dict("records")
     assert [result["method"] for result in results] == ["ampc-adapt_lr=1e-2"] * 2 + ["ampc-adapt_lr=1e-3"] * 2
     assert results[0]["situation"] == results[2]["situation"] != results[1]["situation"]
     shown = capsys.readouterr().out.splitlines()
@@ -40,7 +39,7 @@ def test_values_of_a_setting_are_compared_on_the_same_robots(
 def test_method_has_the_value_and_a_model_of_its_own(tmp_path: Path) -> None:
     task = task_of(0, tmp_path)
     agents = [method_with("ampc-maml", "inner_lr", value).agent(task) for value in ("0.01", "0.1")]
-    assert [agent.hyperparameters.inner_lr for agent in agents if isinstance(agent, ModelBasedAgent)] == [0.01, 0.1]
+    assert [agent.config.to_dict()["inner_lr"] for agent in agents if isinstance(agent, ModelBasedAgent)] == [0.01, 0.1]
     assert {path.stem for path in tmp_path.glob("*.zip")} == {"reacher-maml-inner_lr=0.01", "reacher-maml-inner_lr=0.1"}
 
 
@@ -50,8 +49,8 @@ def test_method_that_is_not_meta_trained_is_refused() -> None:
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_robots_are_drawn_again_as_they_were(robot: str, tmp_path: Path) -> None:
-    robots = [ROBOTS[robot].task(i, tmp_path) for i in (0, 1, 2, 3, 3)]
+def test_robots_are_drawn_again_as_they_were(robot: RobotName, tmp_path: Path) -> None:
+    robots = [ROBOTS[robot](i, tmp_path) for i in (0, 1, 2, 3, 3)]
     assert robots[3] == robots[4]
     assert len(set(robots)) == 4
     drawn = [task.profile for task in robots if isinstance(task.profile, Profile)]
@@ -60,6 +59,5 @@ def test_robots_are_drawn_again_as_they_were(robot: str, tmp_path: Path) -> None
 
 
 def test_gaits_of_a_robot_that_does_not_arrive_are_one_more_than_there_are() -> None:
-    score = ROBOTS["quadruped"].score
-    assert score({"gaits": 12, "reached": True}) == 12
-    assert score({"gaits": 12, "reached": False}) == 81
+    assert score({"gaits": 12, "reached": True}, "quadruped") == 12
+    assert score({"gaits": 12, "reached": False}, "quadruped") == 81

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import ray
 
-from benchmarks.harness import Fleet, Replicate, ReplicateError, load_results, run_replicates
+from benchmarks.results import load
+from benchmarks.runner import Batch, ReplicateError, run_batches
 from famle_agent import FAMLE
 from famle_agent.utils.parallel import parallel
 
@@ -34,13 +35,13 @@ def drawn(seed: int) -> dict[str, Any]:
     return {"values": np.random.default_rng(seed).normal(size=3).tolist(), "process": os.getpid()}
 
 
-def replicates() -> list[Replicate | Fleet]:
-    single = [Replicate("single", seed, partial(drawn, seed)) for seed in range(5)]
-    return [*single, Fleet("fleet", (0, 1), partial(lambda seeds: [drawn(seed) for seed in seeds], (0, 1)))]
+def batches() -> list[Batch]:
+    batches = [Batch("single", (seed,), partial(lambda seed: [drawn(seed)], seed)) for seed in range(5)]
+    return [*batches, Batch("fleet", (0, 1), partial(lambda seeds: [drawn(seed) for seed in seeds], (0, 1)))]
 
 
-def values(folder: Path) -> dict[tuple[str, int], list[float]]:
-    return {(result["method"], result["seed"]): result["values"] for result in load_results(folder)}
+def values(table: Path) -> dict[tuple[str, int], list[float]]:
+    return {(result["method"], result["seed"]): result["values"] for _, result in load(table).iterrows()}
 
 
 def test_two_workers_collect_what_one_process_does(cluster: None) -> None:
@@ -55,10 +56,13 @@ def test_two_workers_collect_what_one_process_does(cluster: None) -> None:
 def test_two_workers_store_what_one_process_does_and_lose_nothing(cluster: None, tmp_path: Path) -> None:
     for backend, jobs in (("loky", 1), ("ray", 2)):
         with pytest.raises(ReplicateError, match="ArithmeticError: a replicate fails"):
-            run_replicates(replicates(), tmp_path / backend, jobs, backend)  # type: ignore[arg-type]
-    assert values(tmp_path / "ray") == values(tmp_path / "loky")
-    assert os.getpid() not in {result["process"] for result in load_results(tmp_path / "ray")}
-    assert set(values(tmp_path / "ray")) == {("single", seed) for seed in (0, 1, 2, 4)} | {("fleet", 0), ("fleet", 1)}
+            run_batches(batches(), tmp_path / f"{backend}.csv", jobs, backend)  # type: ignore[arg-type]
+    assert values(tmp_path / "ray.csv") == values(tmp_path / "loky.csv")
+    assert os.getpid() not in set(load(tmp_path / "ray.csv")["process"])
+    assert set(values(tmp_path / "ray.csv")) == {("single", seed) for seed in (0, 1, 2, 4)} | {
+        ("fleet", 0),
+        ("fleet", 1),
+    }
 
 
 def test_cluster_of_somebody_else_is_left_running(cluster: None) -> None:

@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.reporting.figures import figures
+from benchmarks.reporting.markdown import headline
+from benchmarks.reporting.registry import EXPERIMENTS
+from benchmarks.reporting.report import Report
+from benchmarks.reporting.study import read_study
+from tests.stored_results import store_curves, store_gaits
+
+ROOT = Path(__file__).parents[2]
+
+
+def table_of(results: Path) -> str:
+    studies = [study for one in EXPERIMENTS if (study := read_study(one, results)) is not None]
+    return headline({study.experiment.name: figures(study) for study in studies})
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    """Two experiments, which do not have the same methods."""
+    folder = tmp_path / "results"
+    store_curves(folder, "famle", [[35.0, 35.0, 35.0, 35.0], [37.0, 35.0, 35.0, 35.0]])
+    store_curves(folder, "ppo", [[3.0, 3.0, 3.0, 3.0]])
+    store_curves(folder, "famle-select", [[34.0, 34.0, 34.0, 34.0]])
+    store_gaits(folder, "famle", [10, 20])
+    store_gaits(folder, "ampc", [80, None])
+    return folder
+
+
+def test_table_has_a_row_a_method_and_a_column_an_experiment(results: Path) -> None:
+    assert table_of(results).splitlines() == [
+        "| method | arm: return of the first 50 steps | arm: solved after robot steps "
+        "| quadruped, yaw error: success, gaits |",
+        "| --- | --- | --- | --- |",
+        "| FAMLE | 36.0 | 50 | 100 %, 15.0 +- 7.1 |",
+        "| AMPC |  |  | 50 %, 80.0 |",
+        "| PPO | 3.0 | 0 of 1 in 200 |  |",
+        "",
+        "Replicates: 1 to 2 (reacher-paper), 2 (quadruped-yaw).",
+    ]
+
+
+def test_report_begins_with_the_table(results: Path, tmp_path: Path) -> None:
+    Report(results, tmp_path / "report")()
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert table_of(results) in text.split("## All robots")[1].split("\n## ")[0]
+
+
+def test_readme_and_report_show_what_is_stored() -> None:
+    table = table_of(ROOT / "benchmarks" / "results")
+    assert table in (ROOT / "README.md").read_text(), "quote the first table of benchmarks/report/report.md"
+    assert table in (ROOT / "benchmarks" / "report" / "report.md").read_text()
