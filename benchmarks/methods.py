@@ -147,7 +147,7 @@ def one_simulator(task: Task) -> FAMLE:
     return from_cache(agent, task.cache / f"{task.robot}-one-simulator.zip", lambda agent: agent.meta_learn(["intact"]))
 
 
-ANEW: Mapping[str, Any] = {"keep_adapting": False, "memory_size": 10, "selection_size": 0, "adapt_batch_size": 0}
+ANEW: Mapping[str, Any] = {"warm_start": False, "memory_size": 10, "selection_size": 0, "adapt_batch_size": 0}
 """FAMLE that begins with what was meta-learned at each adaptation, as the paper does, on the last ten transitions."""
 
 
@@ -275,8 +275,8 @@ METHODS: dict[str, Method] = {
     "famle-frozen": Method(partial(famle, adapt_every=0)),
     "famle-anew": Method(partial(famle, **ANEW)),
     "famle-select": Method(partial(famle, adapt_steps=0)),
-    "famle-likeliest": Method(partial(famle, spread_members=False)),
-    "famle-nearest": Method(partial(famle, adapt_steps=0, compose=False, spread_members=False)),
+    "famle-likeliest": Method(partial(famle, posterior_sampling=False)),
+    "famle-nearest": Method(partial(famle, adapt_steps=0, compose=False, posterior_sampling=False)),
     **{name: recipe.method() for name, recipe in META_TRAINED.items()},
     "ppo": Method(ppo.from_scratch),
     "ppo-pretrained": Method(ppo.simulated_first, ppo.learn_simulated),

@@ -62,7 +62,7 @@ class EmbeddingAdapter:
         transition = self.model.encode(obs[:, None], action[:, None], next_obs[:, None])  # (B, 1, ...)
         power = self.settings.likelihood_power
         log_p = power * self.candidates.log_likelihood(self.model, transition)[:, 0]  # (B, C)
-        if not self.settings.keep_adapting:
+        if not self.settings.warm_start:
             return log_p, torch.zeros_like(log_p[:, 0])
         return log_p, power * self.model.log_likelihood(transition, belief.h, belief.theta)[:, 0]
 
@@ -76,7 +76,7 @@ class EmbeddingAdapter:
     def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
         """Selects the most likely embedding (line 6), then takes k gradient steps on theta and h (line 7)."""
         start = self._selected(belief)
-        if self.settings.keep_adapting:
+        if self.settings.warm_start:
             changed = memory.better_explained(start.candidate) & (start.candidate != belief.candidate)
             memory = memory.begun_anew(changed, self.settings.window, start.candidate)
             start = start.where(changed, replace(belief, adaptations=start.adaptations))
@@ -84,7 +84,7 @@ class EmbeddingAdapter:
 
     def model_for(self, belief: Belief, memory: Memory) -> Simulator:
         """Returns theta* and h*; where steps go on, the embedding alone as long as it explains the robot better."""
-        if self.settings.keep_adapting:
+        if self.settings.warm_start:
             better = memory.better_explained(belief.log_posterior.argmax(dim=1))
             if better.any():
                 belief = replace(self._selected(belief).where(better, belief), adaptations=belief.adaptations)
@@ -99,7 +99,7 @@ class EmbeddingAdapter:
         return dict(zip(situations, self.candidates.marginal(belief.posterior)[0].tolist(), strict=True))
 
     def _selected(self, belief: Belief) -> Belief:
-        return select(self.model, self.candidates, belief, self.settings.spread_members)
+        return select(self.model, self.candidates, belief, self.settings.posterior_sampling)
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class GradientAdapter:
 
     def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
         """Takes k gradient steps on theta."""
-        start = belief if self.settings.keep_adapting else self.initial(len(memory.weight))
+        start = belief if self.settings.warm_start else self.initial(len(memory.weight))
         start = replace(start, diverged=belief.diverged, adaptations=belief.adaptations + 1)
         return memory, gradient_steps(self.model, start, memory, self.settings, self.seed)
 

@@ -70,7 +70,7 @@ class GradientSteps:
         batch_size: Transitions per step, drawn from the memory; 0 takes all, as the paper does.
         validation_size: The newest transitions of the memory, which the steps do not see and which decide whether the
             steps are kept; 0 keeps all, as the paper does.
-        keep_adapting: Whether steps go on from where the last ones led, instead of beginning with what was meta-learned
+        warm_start: Whether steps go on from where the last ones led, instead of beginning with what was meta-learned
             each time (the paper's). FAMLE begins anew where another embedding than the one it began with explains the
             robot better than its adapted model does, with the transitions that selected it alone. Where it is the same
             embedding, the steps go on, but the embedding alone plans as long as it explains more.
@@ -82,7 +82,7 @@ class GradientSteps:
     optimizer: Literal["sgd", "adam"] = "adam"
     batch_size: int = 0
     validation_size: int = 0
-    keep_adapting: bool = False
+    warm_start: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.length, Epochs) and not self.batch_size:
@@ -114,7 +114,7 @@ class Adaptation:
             stand for both faults at once; the paper has none.
         likelihood_power: Exponent of the likelihood of a transition; below 1 where errors are not independent of each
             other, so that one strange moment does not overturn what many have shown. The paper's is 1.
-        spread_members: Whether the members of the ensemble start from situations that are sampled from the posterior,
+        posterior_sampling: Whether the members of the ensemble start from situations that are sampled from the posterior,
             instead of all from the most likely one (the paper's).
         gradient: The gradient steps on theta and h; None only selects an embedding.
         clamp_predictions: Whether a plan may imagine no observation beyond the range of those in the memory, as soon as
@@ -128,7 +128,7 @@ class Adaptation:
     evidence: Window | Filter = Window()
     compose: bool = False
     likelihood_power: float = 1.0
-    spread_members: bool = False
+    posterior_sampling: bool = False
     gradient: GradientSteps | None = GradientSteps()
     clamp_predictions: bool = False
 
@@ -147,6 +147,6 @@ class Adaptation:
         return (self.evidence.size if isinstance(self.evidence, Window) else 0) or self.memory_size
 
     @property
-    def keep_adapting(self) -> bool:
+    def warm_start(self) -> bool:
         """Whether there are gradient steps that go on from where the last ones led."""
-        return self.gradient is not None and self.gradient.keep_adapting
+        return self.gradient is not None and self.gradient.warm_start

@@ -19,7 +19,7 @@ _WITHOUT_EMBEDDINGS: Mapping[str, Any] = {
     "interaction_rank": 0,
     "compose": False,
     "hazard": 0.0,
-    "spread_members": False,
+    "posterior_sampling": False,
 }
 
 
@@ -42,7 +42,7 @@ class AMPC(ModelBasedAgent):
         "rounds": 0,
         "joint_iterations": 0,
         "meta_iterations": 0,
-        "keep_adapting": True,
+        "warm_start": True,
     }
     adapter_class = GradientAdapter
 
@@ -54,7 +54,7 @@ class AMPCMAML(ModelBasedAgent):
     """Adaptive MPC whose model was meta-learned, as one starting point for all situations.
 
     Every K steps it takes k gradient steps on the last M transitions, each time from the meta-learned theta (the
-    paper's) or, with the setting ``keep_adapting``, from where the last ones led. The setting ``meta_learner`` says how
+    paper's) or, with the setting ``warm_start``, from where the last ones led. The setting ``meta_learner`` says how
     theta is learnt: ``"reptile"`` (Nichol et al., 2018; Algorithm 1 without embeddings), ``"first-order-maml"`` or
     ``"maml"`` (Finn et al., 2017; the paper's eq. 3 to 5). Arguments as for
     :class:`~famle_agent.agents.agent.ModelBasedAgent`.

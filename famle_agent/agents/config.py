@@ -11,7 +11,7 @@ import dataclasses
 import difflib
 import typing
 import warnings
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
 from typing import Any
@@ -110,7 +110,7 @@ class Config:
             )
 
     @classmethod
-    def of(cls, values: Mapping[str, Any], chosen: Collection[str] = ()) -> Config:
+    def of(cls, values: Mapping[str, Any], chosen: Set[str] = frozenset()) -> Config:
         """Builds settings from a flat mapping; what it does not name has the default.
 
         Args:
@@ -121,7 +121,10 @@ class Config:
             TypeError: A keyword is no setting, or a value is of the wrong type.
             ValueError: A value is out of range, or one that was chosen has no effect beside the others.
         """
-        values = {name: value for name, value in values.items() if name != _UNUSED or value}
+        for old in chosen & _RENAMED.keys():
+            warnings.warn(f"The setting {old} is called {_RENAMED[old]}.", DeprecationWarning, stacklevel=2)
+        values = {_RENAMED.get(name, name): value for name, value in values.items() if name != _UNUSED or value}
+        chosen = {_RENAMED.get(name, name) for name in chosen}
         for name, value in values.items():
             if name not in _HINTS:
                 close = difflib.get_close_matches(name, _HINTS, n=1)
@@ -156,7 +159,7 @@ class Config:
 
     def changed(self, **settings: Any) -> Config:
         """Returns the same with some settings changed, by their keywords; errors as of :meth:`of`."""
-        return Config.of({**self.to_dict(), **settings}, settings)
+        return Config.of({**self.to_dict(), **settings}, settings.keys())
 
     def learnt_otherwise(self, other: Config) -> list[str]:
         """Names the settings by which a model that was meta-learned with these differs from what the others give."""
@@ -315,13 +318,15 @@ _NAMES: dict[type, dict[str, str]] = {
     Adaptation: {
         "every": "adapt_every",
         "at_reset": "adapt_at_reset",
-        **_same("memory_size", "forget_at_reset", "compose", "likelihood_power", "spread_members", "clamp_predictions"),
+        **_same(
+            "memory_size", "forget_at_reset", "compose", "likelihood_power", "posterior_sampling", "clamp_predictions"
+        ),
     },
     Window: {"size": "selection_size"},
     Filter: _same("hazard"),
     GradientSteps: {
         **{name: f"adapt_{name}" for name in ("lr", "embedding_lr", "optimizer", "batch_size")},
-        **_same("validation_size", "keep_adapting"),
+        **_same("validation_size", "warm_start"),
     },
     Steps: {"number": "adapt_steps"},
     Epochs: {"number": "adapt_epochs"},
@@ -363,6 +368,9 @@ _ONLINE = {
 
 _SEEN_IN_DIMS = {"egocentric", "raw_angles"}
 """Settings by which models differ where their dimensions do, which are compared by themselves."""
+
+_RENAMED = {"keep_adapting": "warm_start", "spread_members": "posterior_sampling"}
+"""Settings by the names of version 0.1, which its files have."""
 
 _UNUSED = "adapt_decay"
 """A setting of version 0.1 that is 0 in its files."""

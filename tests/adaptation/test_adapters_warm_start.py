@@ -1,4 +1,4 @@
-"""FAMLE with ``keep_adapting``: on from theta* and h*, anew where another embedding explains the robot better."""
+"""FAMLE with ``warm_start``: on from theta* and h*, anew where another embedding explains the robot better."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def load(agent_file: Path) -> Iterator[Load]:
     agents = []
 
     def loaded(**overrides: object) -> FAMLE:
-        settings = {"keep_adapting": True, "selection_size": WINDOW, "memory_size": 40, "adapt_batch_size": 0}
+        settings = {"warm_start": True, "selection_size": WINDOW, "memory_size": 40, "adapt_batch_size": 0}
         steps = {"adapt_every": 3, "adapt_steps": 10, "planner_iterations": 1}
         agents.append(FAMLE.load(agent_file, device="cpu", **{**settings, **steps, **overrides}))
         return agents[-1]
@@ -70,16 +70,16 @@ def memory(agent: FAMLE) -> Memory:
 # --- life -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("keep_adapting", [True, False])
-def test_belief_is_judged_by_what_it_has_not_seen(load: Load, data: Transitions, keep_adapting: bool) -> None:
-    agent = load(keep_adapting=keep_adapting)
+@pytest.mark.parametrize("warm_start", [True, False])
+def test_belief_is_judged_by_what_it_has_not_seen(load: Load, data: Transitions, warm_start: bool) -> None:
+    agent = load(warm_start=warm_start)
     model = agent.model
     for i in range(8):
         before: Belief = agent.state_of(1).belief
         tell(agent, data, [DEAD], range(i, i + 1))
         seen = memory(agent)
         newest = model.encode(*(values[:, -1:] for values in (seen.obs, seen.action, seen.next_obs)))
-        expected = model.log_likelihood(newest, before.h, before.theta)[:, 0] if keep_adapting else torch.zeros(1)
+        expected = model.log_likelihood(newest, before.h, before.theta)[:, 0] if warm_start else torch.zeros(1)
         if agent.belief.adaptations == before.adaptations:  # else it may have begun anew
             torch.testing.assert_close(seen.own_log_p[:, -1], expected)
 

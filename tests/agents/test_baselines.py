@@ -320,9 +320,9 @@ def test_rival_learns_on_the_robots_from_scratch(load: Load, data: Transitions) 
     ("kind", "settings", "goes_on"),
     [
         ("ampc", {}, True),
-        ("reptile", {"keep_adapting": False}, False),
-        ("maml", {"keep_adapting": False}, False),
-        ("maml", {"keep_adapting": True}, True),
+        ("reptile", {"warm_start": False}, False),
+        ("maml", {"warm_start": False}, False),
+        ("maml", {"warm_start": True}, True),
     ],
 )
 def test_same_memory_teaches_more_only_where_steps_go_on(

@@ -32,7 +32,7 @@ def test_rivals_have_no_embeddings_in_any_mode(make_env: Callable[..., Any], riv
     config = config_of(rival, make_env(), mode)
     model, adaptation, training = config.model, config.adaptation, config.training
     assert (model.embedding_dim, model.interaction_rank, model.gate_actions) == (1, 0, False)
-    assert (adaptation.compose, adaptation.spread_members, type(adaptation.evidence)) == (False, False, Window)
+    assert (adaptation.compose, adaptation.posterior_sampling, type(adaptation.evidence)) == (False, False, Window)
     assert adaptation.gradient is not None
     assert adaptation.gradient.embedding_lr == 0
     assert training.joint is None or training.joint.embedding_lr == 0
@@ -40,7 +40,7 @@ def test_rivals_have_no_embeddings_in_any_mode(make_env: Callable[..., Any], riv
     if rival == "ampc":
         assert config.iterations(config.last_round) == 0
     if mode != "ours":
-        assert adaptation.keep_adapting == (rival == "ampc")
+        assert adaptation.warm_start == (rival == "ampc")
 
 
 @pytest.mark.parametrize("robot", [name for name, robot in known_robots().items() if robot.rivals])

@@ -55,5 +55,5 @@ def test_methods_are_the_shipped_agent_with_something_changed(robot: str, method
     assert agent.dynamics is not None
     assert (adaptation.every == 0) == (method == "famle-frozen")
     assert (adaptation.gradient is None) == (method == "famle-nearest")
-    assert adaptation.spread_members == (method in ("famle", "famle-frozen"))
+    assert adaptation.posterior_sampling == (method in ("famle", "famle-frozen"))
     agent.get_env().close()
