@@ -114,8 +114,8 @@ class Adaptation:
             stand for both faults at once; the paper has none.
         likelihood_power: Exponent of the likelihood of a transition; below 1 where errors are not independent of each
             other, so that one strange moment does not overturn what many have shown. The paper's is 1.
-        posterior_sampling: Whether the members of the ensemble start from situations that are sampled from the posterior,
-            instead of all from the most likely one (the paper's).
+        posterior_sampling: Whether the members of the ensemble start from situations that are sampled from the
+            posterior, instead of all from the most likely one (the paper's).
         gradient: The gradient steps on theta and h; None only selects an embedding.
         clamp_predictions: Whether a plan may imagine no observation beyond the range of those in the memory, as soon as
             a robot has adapted.
