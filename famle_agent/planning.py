@@ -32,13 +32,16 @@ class Planner(ABC):
     candidates: int = 100
 
     @abstractmethod
-    def plan(self, judge: Judge, start: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def plan(
+        self, judge: Judge, start: Tensor, generator: torch.Generator, proposals: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Plans for B robots.
 
         Args:
             judge: Gives the return of candidates.
             start: The plan to begin from, (B, H, action_dim): zeros, or the last plan moved on by one step.
             generator: Source of all the chance, on the device of ``start``.
+            proposals: Plans that somebody else has made, (B, M, H, action_dim), which compete.
 
         Returns:
             The action to apply now, (B, action_dim), and the whole plan, (B, H, action_dim).
@@ -49,10 +52,13 @@ class Planner(ABC):
 class RandomShooting(Planner):
     """The paper's planner: the best of N uniformly random sequences (Rao, 2009). It starts anew each time."""
 
-    def plan(self, judge: Judge, start: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def plan(
+        self, judge: Judge, start: Tensor, generator: torch.Generator, proposals: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """See :meth:`Planner.plan`."""
         shape = (len(start), self.candidates, *start.shape[1:])
         tau = torch.rand(shape, generator=generator, device=start.device) * 2.0 - 1.0
+        tau = tau if proposals is None else torch.cat([tau, proposals], dim=1)
         best = _take(tau, judge(tau).argmax(dim=1, keepdim=True))[:, 0]
         return best[:, 0], best
 
@@ -79,10 +85,16 @@ class ICEM(Planner):
     momentum: float = 0.1
     keep_fraction: float = 0.3
 
-    def plan(self, judge: Judge, start: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def plan(
+        self, judge: Judge, start: Tensor, generator: torch.Generator, proposals: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """See :meth:`Planner.plan`."""
         mean, std = start, torch.full_like(start, self.init_std)
         elites = start[:, None]  # the last plan competes
+        if proposals is not None:
+            elites = torch.cat([elites, proposals], dim=1)
+            elites = _take(elites, judge(elites).topk(min(self.elites, elites.shape[1]), dim=1).indices)
+            mean = elites[:, 0]
         keep = max(1, int(self.keep_fraction * self.elites))
         for _ in range(self.iterations):
             noise = coloured_noise(start, self.candidates, self.noise_beta, generator)
@@ -112,12 +124,15 @@ class MPPI(Planner):
     init_std: float = 0.5
     noise_beta: float = 2.0
 
-    def plan(self, judge: Judge, start: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def plan(
+        self, judge: Judge, start: Tensor, generator: torch.Generator, proposals: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """See :meth:`Planner.plan`."""
         mean = start
         for _ in range(self.iterations):
             noise = self.init_std * coloured_noise(start, self.candidates, self.noise_beta, generator)
             tau = torch.cat([mean[:, None], (mean[:, None] + noise).clamp(-1.0, 1.0)], dim=1)
+            tau = tau if proposals is None else torch.cat([tau, proposals], dim=1)
             returns = judge(tau)
             best = returns.amax(dim=1, keepdim=True)
             finite = torch.where(returns.isfinite(), returns, best).nan_to_num(neginf=0.0)

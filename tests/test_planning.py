@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from famle_agent.models.reward import Objective
 from famle_agent.models.simulator import imagine
 from famle_agent.planning import ICEM, MPPI, Planner, RandomShooting, coloured_noise, shift
 
@@ -34,7 +35,7 @@ def judge_for(goal: Tensor, obs: Tensor | None = None) -> Callable[[Tensor], Ten
         return -(next_obs - goal[:, None]).square().sum(dim=-1)
 
     start = torch.zeros_like(goal) if obs is None else obs
-    return lambda tau: imagine(point_mass, reward, start, tau)
+    return lambda tau: imagine(point_mass, Objective(reward), start, tau)
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -194,7 +195,7 @@ def test_candidates_that_leave_the_numbers_are_never_chosen(make: Make, broken: 
         return torch.where(action[..., :1] > 0, broken, point_mass(obs, action))
 
     def judge(tau: Tensor) -> Tensor:
-        return imagine(model, lambda obs, action, next_obs: next_obs[..., 1], torch.zeros(1, 2), tau)
+        return imagine(model, Objective(lambda obs, action, next_obs: next_obs[..., 1]), torch.zeros(1, 2), tau)
 
     action, tau = plan(make(1), judge)
     assert action[0, 0] <= 0.0

@@ -90,13 +90,17 @@ class EmbeddingAdapter:
                 belief = replace(self._selected(belief).where(better, belief), adaptations=belief.adaptations)
         return simulator_of(self.model, belief, memory, self.settings.clamp_predictions)
 
+    def likely(self, belief: Belief) -> Tensor:
+        """Sums the posterior over what each training situation is a part of, (B, N)."""
+        return self.candidates.marginal(belief.posterior)
+
     def posterior(self, belief: Belief, situations: Sequence[str]) -> dict[str, float]:
         """Names each candidate, ``"a + b"`` where faults are composed, and says how likely it is."""
         return dict(zip(self.candidates.names(situations), belief.posterior[0].tolist(), strict=True))
 
     def marginals(self, belief: Belief, situations: Sequence[str]) -> dict[str, float]:
         """Says how likely each training situation is, alone or as a part of what is wrong."""
-        return dict(zip(situations, self.candidates.marginal(belief.posterior)[0].tolist(), strict=True))
+        return dict(zip(situations, self.likely(belief)[0].tolist(), strict=True))
 
     def _selected(self, belief: Belief) -> Belief:
         return select(self.model, self.candidates, belief, self.settings.posterior_sampling)
@@ -138,6 +142,10 @@ class GradientAdapter:
     def model_for(self, belief: Belief, memory: Memory) -> Simulator:
         """Returns theta*."""
         return simulator_of(self.model, belief, memory, self.settings.clamp_predictions)
+
+    def likely(self, belief: Belief) -> Tensor:
+        """Returns ones, (B, 1): there is nothing to tell apart."""
+        return torch.ones_like(belief.log_posterior)
 
     def posterior(self, belief: Belief, situations: Sequence[str]) -> dict[str, float]:
         """Puts all the probability on the one model that there is."""

@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from famle_agent.adaptation.belief import Belief
+from famle_agent.adaptation.guide import Guide
 from famle_agent.adaptation.memory import Memory
-from famle_agent.models.reward import RewardFn
+from famle_agent.models.reward import Objective
 from famle_agent.models.simulator import Simulator
 from famle_agent.planning import Planner, shift
 
@@ -98,6 +99,9 @@ class Adapter(Protocol):
     def model_for(self, belief: Belief, memory: Memory) -> Simulator:
         """Returns the dynamics that a belief stands for."""
 
+    def likely(self, belief: Belief) -> Tensor:
+        """Returns how likely each training situation is, alone or as a part, (B, N)."""
+
     def posterior(self, belief: Belief, situations: Sequence[str]) -> dict[str, float]:
         """Returns P(situation | memory) of the first robot by name, given those of the training situations."""
 
@@ -112,18 +116,20 @@ class Controller:
     Attributes:
         adapter: Says what robots believe.
         planner: MPC.
-        reward_fn: r(s, a, s') with actions in [-1, 1].
+        objective: What the planner maximises, with actions in [-1, 1].
         adapt_every: K; 0 never adapts while an episode lasts.
         adapt_at_reset: Whether to adapt when an episode ends.
         forget_at_reset: Whether a new episode empties a robot's memory.
+        guide: A policy that proposes plans and sees beyond their end; None plans without.
     """
 
     adapter: Adapter
     planner: Planner
-    reward_fn: RewardFn
+    objective: Objective
     adapt_every: int
     adapt_at_reset: bool = False
     forget_at_reset: bool = False
+    guide: Guide | None = None
 
     def init(self, belief: Belief, memory: Memory) -> OnlineState:
         """Returns the state of B robots that believe what the adapter says, with an empty memory (line 1)."""
@@ -159,7 +165,14 @@ class Controller:
         """Plans an action in [-1, 1], (B, action_dim), with the adapted model (line 8)."""
         state = self.reset(state, starts)
         model = self.adapter.model_for(state.belief, state.memory)
-        action, plan = self.planner.plan(lambda tau: model.returns(self.reward_fn, obs, tau), state.plan, generator)
+        objective, proposals = self.objective, None
+        if self.guide is not None:
+            likely = self.adapter.likely(state.belief)
+            proposals = self.guide.proposals(model, obs, likely, self.planner.horizon, generator)
+            objective = self.guide.looking_beyond(objective, likely, model.members)
+        action, plan = self.planner.plan(
+            lambda tau: model.returns(objective, obs, tau), state.plan, generator, proposals
+        )
         return action, replace(state, plan=shift(plan), last=(obs, action))
 
     def reset(self, state: OnlineState, starts: Tensor) -> OnlineState:

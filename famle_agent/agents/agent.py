@@ -26,6 +26,7 @@ from typing_extensions import Self
 from famle_agent.adaptation.adapters import EmbeddingAdapter, GradientAdapter
 from famle_agent.adaptation.belief import Belief
 from famle_agent.adaptation.controller import Adapter, Controller, OnlineState
+from famle_agent.agents.check import Check, check_plans
 from famle_agent.agents.checkpoint import Checkpoint, File, joined
 from famle_agent.agents.config import Config
 from famle_agent.agents.meta_training import meta_train, planning_policy, simulate
@@ -49,7 +50,7 @@ from famle_agent.data.policies import MakePolicy
 from famle_agent.data.transitions import Transitions
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import prepare_torch
-from famle_agent.models.reward import RewardFn
+from famle_agent.models.reward import RewardFn, TerminationFn
 from famle_agent.training.run_folder import RunFolder
 
 __all__ = ["ModelBasedAgent"]
@@ -67,6 +68,9 @@ class ModelBasedAgent(BaseAlgorithm):
         reward_fn: r(s, a, s') for torch tensors (..., dim) -> (...), what the planner maximises. None takes the
             environment's ``planning_reward_fn`` or ``reward_fn``, and where it has neither the reward is learnt with
             the dynamics.
+        termination_fn: Whether an episode ends in s', for torch tensors (..., obs_dim) -> (...), so that the planner
+            knows. None takes the environment's ``termination_fn``, and where it has none the ends are learnt with the
+            dynamics, if there are any.
         angle_dims: Observation dimensions that are angles in rad. None takes the environment's ``angle_dims`` unless
             the settings say ``raw_angles``.
         quaternion_dims: The four observation dimensions of a unit quaternion, or none of them. None takes the
@@ -87,6 +91,7 @@ class ModelBasedAgent(BaseAlgorithm):
         policy: What the agent has learnt, and how it acts on it.
         num_timesteps: Steps that the agent has lived on robots.
         num_iterations: Iterations of learning in the last meta-training.
+        last_check: What planning was worth in simulation when it ended; None where nobody looked.
 
     Raises:
         TypeError: An override is no setting.
@@ -103,6 +108,7 @@ class ModelBasedAgent(BaseAlgorithm):
     policy: AdaptivePolicy  # type: ignore[assignment]
     observation_space: spaces.Box
     action_space: spaces.Box
+    last_check: Check | None
     _live: OnlineState | None
 
     def __init__(
@@ -111,6 +117,7 @@ class ModelBasedAgent(BaseAlgorithm):
         mode: str = "ours",
         *,
         reward_fn: RewardFn | None = None,
+        termination_fn: TerminationFn | None = None,
         angle_dims: Sequence[int] | None = None,
         quaternion_dims: Sequence[int] | None = None,
         pose_dims: Sequence[int] | None = None,
@@ -141,7 +148,7 @@ class ModelBasedAgent(BaseAlgorithm):
             config = robot.config(mode, self._preset(overrides), self._implied(overrides), **overrides)
         elif overrides:
             config = config.changed(**overrides)
-        self.policy = AdaptivePolicy(config, self.adapter_class, self.device, reward_fn)
+        self.policy = AdaptivePolicy(config, self.adapter_class, self.device, reward_fn, termination_fn)
         self.generator = torch.Generator(self.device)
         if self.env is not None:
             given = {"angle_dims": angle_dims, "quaternion_dims": quaternion_dims, "pose_dims": pose_dims}
@@ -170,7 +177,7 @@ class ModelBasedAgent(BaseAlgorithm):
 
     def _setup_model(self) -> None:
         self.policy.world = self._live = None
-        self.num_iterations = 0
+        self.num_iterations, self.last_check = 0, None
         self._served: object = None
         self._warned_of_divergence = False
         self.generator.seed()
@@ -203,6 +210,7 @@ class ModelBasedAgent(BaseAlgorithm):
         """Looks for what to maximise in an environment, unless the user has said it."""
         if self.policy.user_reward_fn is None:
             self.policy.env_reward_fn = planning_reward(env, self.config.planning_reward)
+        self.policy.env_termination_fn = env_attribute(env, "termination_fn", None)
 
     def _require_env(self) -> VecEnv:
         if self.env is None:
@@ -276,6 +284,7 @@ class ModelBasedAgent(BaseAlgorithm):
         progress_bar: bool = False,
         n_jobs: int = 1,
         folder: str | os.PathLike[str] | None = None,
+        check: bool | None = None,
     ) -> Self:
         """Learns in simulation: collects transitions in every situation, then learns the model from them.
 
@@ -294,6 +303,9 @@ class ModelBasedAgent(BaseAlgorithm):
             n_jobs: Processes that simulate, -1 for one a core. The result does not depend on it.
             folder: Where transitions are stored as they come, the model after each round, and once a minute how far
                 a round has got. The same call goes on where one that was stopped had got to.
+            check: Whether to compare the agent's planning in simulation with doing nothing and acting at random in the
+                end, and to warn where it is not better. None does so on robots that the package has no settings for.
+                The result is in ``last_check``, in TensorBoard, and printed with ``verbose=1``.
 
         Returns:
             The agent.
@@ -331,7 +343,26 @@ class ModelBasedAgent(BaseAlgorithm):
             self.policy.world = known  # a half-learnt model is none
             raise
         hooks.on_training_end()
+        unknown = self.env is not None and robot_of(env_id(self.env)).name == "default"
+        if isinstance(source, SituationEnvs) and (unknown if check is None else check):
+            self._check(source)
         return self
+
+    def _check(self, envs: SituationEnvs) -> None:
+        """Compares planning in simulation with knowing nothing, and warns where it is not better."""
+        found = self.last_check = check_plans(self, envs, self.seed or 0)
+        for name in ("planned", "nothing", "random"):
+            self.logger.record(f"check/{name}", float(np.median(getattr(found, name))))
+        self.logger.dump(self.num_iterations)
+        if self.verbose:
+            print(found)
+        if not found.worth:
+            warnings.warn(
+                "In simulation, planning with what was learnt is no better than doing nothing or acting at random, so "
+                "that it will not be on the robot either. Try more simulated steps (policy_steps), a reward_fn, fewer "
+                f"or milder situations, or whether Stable-Baselines3's SAC learns the intact robot at all.\n{found}",
+                stacklevel=3,
+            )
 
     def collect(self, envs: SituationsLike | None = None, progress_bar: bool = False, n_jobs: int = 1) -> Transitions:
         """Collects the random transitions that :meth:`meta_learn` learns from; arguments as there."""
@@ -600,8 +631,7 @@ class ModelBasedAgent(BaseAlgorithm):
             episodes=self._episode_num,
             live=None if live is None else live.counts,
             tensors=joined(
-                dynamics={} if world is None else world.dynamics.state_dict(),
-                reward={} if world is None or world.reward is None else world.reward.state_dict(),
+                **({} if world is None else {name: part.state_dict() for name, part in world.parts().items()}),
                 live={} if live is None else live.to_tensors(),
                 # The state of another device's generator means nothing elsewhere.
                 generator={"state": self.generator.get_state()} if self.device.type == "cpu" else {},
@@ -686,8 +716,9 @@ class ModelBasedAgent(BaseAlgorithm):
         policy = self.policy
         known = policy.world, self._live
         try:
-            if weights := stored.part("dynamics"):
-                policy.world = policy.builder.load(weights, stored.part("reward"), stored.situations)
+            weights = {name: stored.part(name) for name in ("dynamics", "reward", "termination", "actor_critic")}
+            if weights["dynamics"]:
+                policy.world = policy.builder.load(weights, stored.situations)
             if stored.live is not None:
                 self._live = policy.stored_state(stored.part("live"), stored.live)
             if self.device.type == "cpu" and (generator := stored.part("generator")):

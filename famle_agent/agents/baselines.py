@@ -11,6 +11,7 @@ from famle_agent.agents.agent import ModelBasedAgent
 __all__ = ["AMPC", "AMPCMAML"]
 
 _WITHOUT_EMBEDDINGS: Mapping[str, Any] = {
+    "policy_steps": 0,
     "embedding_dim": 1,
     "embedding_lr": 0.0,
     "adapt_embedding_lr": 0.0,

@@ -181,7 +181,7 @@ class Checkpoint:
 
     def model_alone(self) -> Checkpoint:
         """Returns the same with the weights only: no online state, and no random numbers."""
-        weights = {name: value for name, value in self.tensors.items() if name.startswith(("dynamics/", "reward/"))}
+        weights = {name: value for name, value in self.tensors.items() if not name.startswith(("live/", "generator/"))}
         return replace(self, live=None, tensors=weights)
 
     def check_agent(self, kind: str, has_reward_fn: bool) -> None:

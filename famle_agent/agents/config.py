@@ -22,6 +22,7 @@ from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.planning import ICEM, MPPI, Planner, RandomShooting
 from famle_agent.training.maml import MAML
 from famle_agent.training.multitask import JointTraining
+from famle_agent.training.policy_search import PolicySearch
 from famle_agent.training.reptile import Reptile
 from famle_agent.training.trainer import MetaTrainer
 
@@ -55,12 +56,15 @@ class Simulation:
         action_hold: Steps that a random action is held; the paper's is 1.
         episode_length: Steps of a simulated episode, apart from the task's time limit; 0 takes that.
         rounds: What is simulated after that; None, the paper's, learns from random actions alone.
+        policy: A policy for all situations that is learnt first; what it went through takes the place of random
+            actions. None, the paper's, learns none.
     """
 
     transitions_per_situation: int = 2000
     action_hold: int = 1
     episode_length: int = 0
     rounds: Rounds | None = None
+    policy: PolicySearch | None = None
 
     @property
     def planned(self) -> int:
@@ -155,7 +159,7 @@ class Config:
             found["meta_learner"] = "first-order-maml" if self.training.meta_learner.first_order else "maml"
         elif self.training.meta_learner is not None:
             found["meta_learner"] = "reptile"
-        return found | {"hidden": list(self.model.hidden)}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
 
     def changed(self, **settings: Any) -> Config:
         """Returns the same with some settings changed, by their keywords; errors as of :meth:`of`."""
@@ -230,7 +234,12 @@ class _Reader:
 
 def _simulation(read: _Reader) -> Simulation:
     rounds = read.part(Rounds) if read["rounds"] else None
-    return Simulation(**{name: read[name] for name in _NAMES[Simulation]}, rounds=rounds)
+    if not read["policy_steps"]:
+        random_alone: Simulation = read.part(Simulation, rounds=rounds)
+        return random_alone
+    idle = read.idle()  # random actions, whose place the policy's take
+    n, hold = idle["transitions_per_situation"], idle["action_hold"]
+    return Simulation(n, hold, read["episode_length"], rounds, read.part(PolicySearch))
 
 
 def _training(read: _Reader) -> MetaTrainer:
@@ -305,6 +314,17 @@ _NAMES: dict[type, dict[str, str]] = {
         "iterations": "round_iterations",
         "restart_last": "restart_last_round",
     },
+    PolicySearch: {
+        "steps": "policy_steps",
+        "total_steps": "policy_total_steps",
+        "updates_per_step": "policy_updates_per_step",
+        "batch_size": "policy_batch_size",
+        "lr": "policy_lr",
+        "hidden": "policy_hidden",
+        "discount": "discount",
+        "random_steps": "policy_random_steps",
+        "untold": "policy_untold",
+    },
     ModelConfig: _same(*(field.name for field in dataclasses.fields(ModelConfig))),
     JointTraining: {name: f"joint_{name}" for name in ("iterations", "lr", "embedding_lr", "batch_size")},
     Reptile: {**_META, **_same("embedding_meta_lr")},
@@ -337,7 +357,10 @@ _NAMES: dict[type, dict[str, str]] = {
 }
 """The keyword of each field of each part."""
 
-_SWITCHED_OFF = {"rounds": 0, "joint_iterations": 0, "meta_iterations": 0, "hazard": 0.0, "adapt_steps": 0}
+_SWITCHED_OFF = {
+    **dict.fromkeys(("policy_steps", "rounds", "joint_iterations", "meta_iterations", "adapt_steps"), 0),
+    "hazard": 0.0,
+}
 """What keywords say of a part that is not there."""
 
 _DEFAULTS: dict[str, Any] = {
@@ -376,7 +399,16 @@ _UNUSED = "adapt_decay"
 """A setting of version 0.1 that is 0 in its files."""
 
 _AT_LEAST_ONE = {
-    *("transitions_per_situation", "action_hold", "round_transitions", "embedding_dim", "members", "joint_batch_size"),
+    *(
+        "policy_total_steps",
+        "policy_batch_size",
+        "transitions_per_situation",
+        "action_hold",
+        "round_transitions",
+        "embedding_dim",
+        "members",
+        "joint_batch_size",
+    ),
     *("inner_steps", "batch_size", "query_size", "meta_batch_size", "memory_size"),
     *("horizon", "candidates", "planner_iterations", "elites"),
 }
@@ -394,6 +426,8 @@ _CHOICES: dict[str, tuple[Any, ...]] = {
 _ADAPTING = "adapt_every or adapt_at_reset"
 _NEEDS = {
     **dict.fromkeys(_NAMES[Rounds].values(), "rounds"),
+    **dict.fromkeys(_NAMES[PolicySearch].values(), "policy_steps"),
+    **dict.fromkeys(("transitions_per_situation", "action_hold"), "no policy_steps"),
     **dict.fromkeys(_NAMES[JointTraining].values(), "joint_iterations"),
     **dict.fromkeys(_NAMES[InnerLoop].values(), "meta_iterations, or an adaptation that has no rate of its own"),
     **dict.fromkeys((*_META.values(), "meta_learner"), "meta_iterations"),
@@ -423,7 +457,7 @@ def _check_type(name: str, value: Any) -> None:
     kinds = typing.get_args(_HINTS[name]) or (_HINTS[name],)
     if value is None and type(None) in kinds:
         return
-    if name == "hidden":
+    if name in ("hidden", "policy_hidden"):
         if isinstance(value, str) or not isinstance(value, Iterable):
             raise TypeError(f"{name} must be a list of whole numbers, got {value!r}.")
         return

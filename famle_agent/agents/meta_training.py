@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import torch
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -22,12 +23,15 @@ from famle_agent.data.collect import collect
 from famle_agent.data.envs import SituationEnvs
 from famle_agent.data.policies import MakePolicy, make_held_uniform, make_planning, reward_names
 from famle_agent.data.transitions import Transitions
+from famle_agent.models.actor_critic import ActorCritic
 from famle_agent.models.dynamics import Batch, Dynamics
+from famle_agent.training.policy_search import PolicySearch, Search
 from famle_agent.training.progress import Progress
 from famle_agent.training.run_folder import RunFolder
 from famle_agent.training.trainer import Metrics
+from famle_agent.utils.atomic_write import whole_file
 
-__all__ = ["Learner", "begin_model", "meta_train", "planning_policy", "simulate"]
+__all__ = ["Learner", "begin_model", "meta_train", "planning_policy", "search_policy", "simulate"]
 
 
 class Learner(Protocol):
@@ -70,27 +74,34 @@ def meta_train(
     Yields:
         The losses of each iteration.
     """
-    policy, config, transitions = agent.policy, agent.policy.config, None
+    policy, config, transitions, actor_critic = agent.policy, agent.policy.config, None, None
     last = 0 if isinstance(source, Transitions) else config.last_round
     bar = partial(_bar, rounds=last + 1, disable=not progress_bar)
+    reports = 0  # iterations before the first of the model's
     for number in range(last + 1):
         # Lines 1 to 6: transitions D_c of every situation c.
         new = source
-        if isinstance(new, SituationEnvs):
+        if isinstance(new, SituationEnvs) and number == 0 and config.simulation.policy is not None:
+            total = config.simulation.policy.steps_of_each(len(new.sources)) * len(new.sources)
+            with bar("Learning a policy", number, total, "step") as shown:
+                new, actor_critic = yield from search_policy(agent, new, folder, shown.update)
+        elif isinstance(new, SituationEnvs):
             with bar("Simulating", number, config.simulation.transitions(number) * len(new.sources), "step") as shown:
                 new = simulate(agent, new, number, n_jobs, folder.transitions(number), shown.update)
+        reports = agent.num_iterations if number == 0 else reports
         new = policy.builder.in_model_units(new)
         transitions = new if transitions is None else transitions.followed_by(new)
         if (stored := folder.finished(number)) is not None:
             agent.restore(stored)
-            agent.num_iterations = config.iterations(number, number == last)
+            agent.num_iterations = reports + config.iterations(number, number == last)
             continue
 
         # Lines 7 to 14: theta and H from them.
-        left = config.iterations(number, number == last) - agent.num_iterations
+        left = reports + config.iterations(number, number == last) - agent.num_iterations
         with bar("Meta-learning", number, left, "it") as shown, torch.random.fork_rng(devices=[]):
             torch.manual_seed(agent.draw_seed())  # initial weights come from torch's global generator
-            model, data = begin_model(policy, transitions, config.begins_anew(number, number == last), agent.generator)
+            anew = config.begins_anew(number, number == last)
+            model, data = begin_model(policy, transitions, anew, agent.generator, actor_critic)
             progress = partial(_progress, agent, folder, number, shown)
             for metrics in config.trainer(number, number == last).fit(model, data, agent.generator, progress):
                 shown.set_postfix({key.split("/")[-1]: f"{value:.3g}" for key, value in metrics.items()}, refresh=False)
@@ -98,6 +109,48 @@ def meta_train(
                 agent.num_iterations += 1
                 yield metrics
         folder.finish(number, agent.save)
+
+
+def search_policy(
+    agent: Learner, envs: SituationEnvs, folder: RunFolder, callback: Callable[[int], Any]
+) -> Generator[Metrics, None, tuple[Transitions, ActorCritic]]:
+    """Learns a policy for all situations, or reads the one that a stopped run has learnt.
+
+    Args:
+        agent: Its settings count.
+        envs: The situations.
+        folder: Where the policy and its transitions are stored.
+        callback: Is told how many steps have been simulated since it was last told.
+
+    Yields:
+        Returns in simulation; each report counts as an iteration.
+
+    Returns:
+        All that the policy went through, and what was learnt.
+    """
+    builder, simulation, seed = agent.policy.builder, agent.policy.config.simulation, agent.draw_seed()
+    settings = simulation.policy or PolicySearch()
+    data, weights = folder.search()
+    if data is not None and weights is not None and weights.exists():
+        actor_critic = builder.actor_critic(len(envs.situations), settings.hidden)
+        actor_critic.load_state_dict(load_file(weights))
+        return Transitions.load(data), actor_critic.requires_grad_(False)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        search = Search(settings, envs.sources, envs.situations, seed, simulation.episode_length)
+        try:
+            for metrics in search.run():
+                callback(search.reported)
+                agent.num_iterations += 1
+                yield metrics
+            transitions, actor_critic = search.transitions(), search.actor_critic()
+        finally:
+            search.close()
+    if data is not None and weights is not None:
+        transitions.save(data)
+        with whole_file(weights) as partial_file:
+            save_file(actor_critic.state_dict(), partial_file)
+    return transitions, actor_critic.to(builder.device)
 
 
 def simulate(
@@ -138,30 +191,39 @@ def planning_policy(policy: AdaptivePolicy) -> MakePolicy:
 
 
 def begin_model(
-    policy: AdaptivePolicy, transitions: Transitions, anew: bool, generator: torch.Generator
+    policy: AdaptivePolicy,
+    transitions: Transitions,
+    anew: bool,
+    generator: torch.Generator,
+    actor_critic: ActorCritic | None = None,
 ) -> tuple[Dynamics, Batch]:
-    """Gives a policy the model that is learnt in a round, and learns the reward where none is known.
+    """Gives a policy the model that is learnt in a round, and learns reward and ends of episodes where none are known.
 
     Args:
         policy: Its ``world`` is replaced.
         transitions: All so far, with actions in [-1, 1].
         anew: Whether to begin with a new model, instead of going on with the one so far.
         generator: Source of all the chance, but for the initial weights.
+        actor_critic: What to do in each situation, if that was learnt.
 
     Returns:
         The model, and the transitions as it sees them.
     """
-    builder, reward = policy.builder, None
+    builder, reward, termination = policy.builder, None, None
     obs, action, next_obs = builder.tensors(transitions)
     if policy.known_reward_fn is None:
         reward = builder.reward()
         reward.fit(obs, action, next_obs, builder.tensor(transitions.reward), generator)
+    if policy.known_termination_fn is None and transitions.ended.any():
+        termination = builder.termination()
+        ended = torch.as_tensor(transitions.ended, device=next_obs.device)
+        termination.fit(next_obs, ended, generator)
     if anew:
         model = builder.dynamics(len(transitions.situations))
         model.fit_normalisation(obs, action, next_obs)
     else:
         model = policy.model
-    policy.world = WorldModel(model, transitions.situations, reward)
+    policy.world = WorldModel(model, transitions.situations, reward, termination, actor_critic)
     return model, model.encode(obs, action, next_obs)
 
 

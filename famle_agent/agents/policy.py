@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -10,11 +11,12 @@ from torch import Tensor
 
 from famle_agent.adaptation.adapters import EmbeddingAdapter, GradientAdapter
 from famle_agent.adaptation.controller import Adapter, Controller, OnlineState
+from famle_agent.adaptation.guide import Guide
 from famle_agent.adaptation.memory import Memory
 from famle_agent.agents.config import Config
 from famle_agent.agents.world_model import Interface, ModelBuilder, WorldModel
 from famle_agent.models.dynamics import Dynamics
-from famle_agent.models.reward import RewardFn
+from famle_agent.models.reward import Objective, RewardFn, TerminationFn
 from famle_agent.utils.errors import NotLearnedError
 
 __all__ = ["AdaptivePolicy"]
@@ -28,11 +30,13 @@ class AdaptivePolicy:
         adapter_class: What adapts the model; a gradient adapter has no use for more than one embedding.
         device: Where models compute.
         reward_fn: The reward that the user has given; None takes the environment's or the learnt one.
+        termination_fn: Where episodes end, as the user says; None takes the environment's or what was learnt.
 
     Attributes:
         robot: What the robot's observations and actions are; None where no robot is known yet.
         world: What was meta-learned; None before that.
         env_reward_fn: The environment's reward, if it names one.
+        env_termination_fn: The environment's ends of episodes, if it names them.
         not_taken: By what a shipped model differs from what was asked for.
         seed: Seed of the minibatches of an adaptation.
     """
@@ -43,11 +47,14 @@ class AdaptivePolicy:
         adapter_class: type[EmbeddingAdapter | GradientAdapter],
         device: torch.device,
         reward_fn: RewardFn | None,
+        termination_fn: TerminationFn | None = None,
     ) -> None:
-        self.config, self.adapter_class, self.device, self.user_reward_fn = config, adapter_class, device, reward_fn
+        self.config, self.adapter_class, self.device = config, adapter_class, device
+        self.user_reward_fn, self.user_termination_fn = reward_fn, termination_fn
         self.robot: Interface | None = None
         self.world: WorldModel | None = None
         self.env_reward_fn: RewardFn | None = None
+        self.env_termination_fn: TerminationFn | None = None
         self.not_taken: list[str] = []
         self.seed = 0
         self._known_adapter: tuple[tuple[Any, ...], Adapter] | None = None
@@ -101,9 +108,14 @@ class AdaptivePolicy:
             NotLearnedError: There is no model yet.
             ValueError: There is no reward.
         """
-        adapter, how = self.adapter, self.config.adaptation
-        reward_fn = self.unit_reward_fn()
-        return Controller(adapter, self.config.planner, reward_fn, how.every, how.at_reset, how.forget_at_reset)
+        adapter, how, world = self.adapter, self.config.adaptation, self.world
+        objective, guide = Objective(self.unit_reward_fn(), self.known_termination_fn), None
+        if world is not None and objective.termination_fn is None:
+            objective = replace(objective, termination_fn=world.termination)
+        if world is not None and world.actor_critic is not None:
+            guide = Guide(world.actor_critic)
+        when = how.every, how.at_reset, how.forget_at_reset
+        return Controller(adapter, self.config.planner, objective, *when, guide)
 
     def initial(self, robots: int) -> OnlineState:
         """Returns the state of B robots that have seen nothing.
@@ -134,6 +146,11 @@ class AdaptivePolicy:
     def known_reward_fn(self) -> RewardFn | None:
         """The user's reward function, or the environment's; None where it has to be learnt."""
         return self.user_reward_fn or self.env_reward_fn
+
+    @property
+    def known_termination_fn(self) -> TerminationFn | None:
+        """The user's ends of episodes, or the environment's; None where they have to be learnt."""
+        return self.user_termination_fn or self.env_termination_fn
 
     def unit_reward_fn(self) -> RewardFn:
         """Returns the reward r(s, a, s') of actions in [-1, 1], the user's, the environment's or the learnt one.

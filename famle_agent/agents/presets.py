@@ -74,7 +74,7 @@ def known_robots() -> dict[str, Robot]:
     robots = {}
     for name, entry in entries.items():
         # A file says only what differs: of the paper's settings for any robot, and of the paper's for this one.
-        modes = {"ours": any_robot["ours"] | entry["ours"], "paper": any_robot["paper"] | entry["paper"]}
+        modes = {"ours": entry["ours"], "paper": any_robot["paper"] | entry["paper"]}
         if "original" in entry:
             modes["original"] = modes["paper"] | entry["original"]
         robots[name] = Robot(name, entry["env_id"], modes, entry["rivals"])

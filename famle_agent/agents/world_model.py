@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from gymnasium import spaces
-from torch import Tensor
+from torch import Tensor, nn
 
 from famle_agent.data.action_scaling import ActionScale
 from famle_agent.data.transitions import Transitions
+from famle_agent.models.actor_critic import ActorCritic
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.observation import ObservationLayout
-from famle_agent.models.reward import LearnedReward
+from famle_agent.models.reward import LearnedReward, LearnedTermination
 
 __all__ = ["Interface", "ModelBuilder", "ModelConfig", "WorldModel"]
 
@@ -70,11 +71,20 @@ class WorldModel:
         dynamics: Holds theta_meta and H_meta.
         situations: What the training situations are called, in the order of the embeddings.
         reward: The learnt reward; None where the environment or the user says it.
+        termination: Where episodes end; None where somebody says it, or where none ended by itself.
+        actor_critic: What to do in each situation, as learnt in simulation; None where that was not learnt.
     """
 
     dynamics: Dynamics
     situations: tuple[str, ...]
     reward: LearnedReward | None = None
+    termination: LearnedTermination | None = None
+    actor_critic: ActorCritic | None = None
+
+    def parts(self) -> dict[str, nn.Module]:
+        """The networks that there are, by name."""
+        named = {"dynamics": self.dynamics, "reward": self.reward, "termination": self.termination}
+        return {name: part for name, part in {**named, "actor_critic": self.actor_critic}.items() if part is not None}
 
 
 @dataclass(frozen=True)
@@ -137,20 +147,37 @@ class ModelBuilder:
         """Makes an untrained reward r(s, a, s')."""
         return LearnedReward(self.robot.layout, self.robot.action_space.shape[0]).to(self.device)
 
-    def load(self, dynamics: dict[str, Tensor], reward: dict[str, Tensor], situations: tuple[str, ...]) -> WorldModel:
-        """Makes a model of stored weights.
+    def termination(self) -> LearnedTermination:
+        """Makes untrained ends of episodes."""
+        return LearnedTermination(self.robot.layout).to(self.device)
+
+    def actor_critic(self, situations: int, hidden: Sequence[int]) -> ActorCritic:
+        """Makes an untrained actor-critic for N situations."""
+        sizes = self.robot.observation_space.shape[0], self.robot.action_space.shape[0], situations
+        return ActorCritic(*sizes, hidden).to(self.device)
+
+    def load(self, weights: Mapping[str, dict[str, Tensor]], situations: tuple[str, ...]) -> WorldModel:
+        """Makes a model of stored weights, by the names of :meth:`WorldModel.parts`.
 
         Raises:
             KeyError: Weights are missing.
             RuntimeError: The weights are of another architecture.
         """
-        robots = max(1, len(dynamics["embeddings"]) // self.config.members)
-        model = self.dynamics(len(situations), robots)
-        model.load_state_dict(dynamics)
-        learned = self.reward() if reward else None
-        if learned is not None:
-            learned.load_state_dict(reward)
-        return WorldModel(model, situations, learned)
+        robots = max(1, len(weights["dynamics"]["embeddings"]) // self.config.members)
+        parts: dict[str, Any] = {"dynamics": self.dynamics(len(situations), robots)}
+        if weights.get("reward"):
+            parts["reward"] = self.reward()
+        if weights.get("termination"):
+            parts["termination"] = self.termination()
+        if policy := weights.get("actor_critic"):
+            layers = {
+                int(name.split(".")[1]): len(value) for name, value in policy.items() if name.startswith("actor.")
+            }
+            parts["actor_critic"] = self.actor_critic(len(situations), [layers[i] for i in sorted(layers)[:-1]])
+        for name, part in parts.items():
+            part.load_state_dict(weights[name])
+            part.requires_grad_(name == "dynamics")
+        return WorldModel(situations=situations, **parts)
 
     @property
     def action_scale(self) -> ActionScale:

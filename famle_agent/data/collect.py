@@ -66,7 +66,8 @@ def collect(
         name: np.concatenate([getattr(parts[i], name) for i in range(len(envs))])
         for name in ("obs", "action", "reward", "next_obs")
     }
-    return Transitions(**arrays, situations=tuple(situations))
+    ended = np.concatenate([parts[i].ended for i in range(len(envs))])
+    return Transitions(**arrays, situations=tuple(situations), terminated=ended if ended.any() else None)
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,7 @@ def _in_process(task: _Task) -> tuple[int, Transitions]:
 def _run_policy(env: gym.Env[Any, Any], task: _Task) -> Transitions:
     policy = task.make_policy(env, task.index, np.random.default_rng(task.sequence))
     rows: list[tuple[Any, Any, Any, Any]] = []
+    ended: list[bool] = []
     obs = np.array(env.reset(seed=int(task.sequence.generate_state(1)[0]))[0])
     episode_start, age = True, 0
     while len(rows) < task.n:
@@ -119,10 +121,12 @@ def _run_policy(env: gym.Env[Any, Any], task: _Task) -> Transitions:
         next_obs, reward, terminated, truncated, _ = env.step(action)
         next_obs = np.array(next_obs)  # a copy: an environment may fill the same array again
         rows.append((obs, action, reward, next_obs))
+        ended.append(bool(terminated))
         age += 1
         obs, episode_start = next_obs, terminated or truncated or age == task.episode_length
         if episode_start:
             obs, age = np.array(env.reset()[0]), 0
     columns = [np.array(column, dtype=np.float32)[None] for column in zip(*rows, strict=True)]
     obs_, action_, reward_, next_obs_ = columns
-    return Transitions(obs_, action_, reward_, next_obs_, (task.situation,))
+    terminated_ = np.array([ended]) if any(ended) else None
+    return Transitions(obs_, action_, reward_, next_obs_, (task.situation,), terminated_)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from famle_agent.data.action_scaling import ActionScale, to_action_space
 from famle_agent.models.dynamics import Dynamics
-from famle_agent.models.reward import RewardFn
+from famle_agent.models.reward import Objective, RewardFn
 from famle_agent.models.simulator import Simulator
 from famle_agent.planning import Planner, shift
 
@@ -82,7 +82,7 @@ class PlanningPolicy:
         action_space: gym.spaces.Box,
         generator: torch.Generator,
     ) -> None:
-        self._model, self._reward_fn = model, reward_fn
+        self._model, self._objective = model, Objective(reward_fn)
         self._planner, self._space, self._generator = planner, action_space, generator
         self._plan: Tensor | None = None
 
@@ -94,7 +94,7 @@ class PlanningPolicy:
         state = torch.as_tensor(obs, dtype=torch.float32)[None]
 
         def judge(tau: Tensor) -> Tensor:
-            return self._model.returns(self._reward_fn, state, tau)
+            return self._model.returns(self._objective, state, tau)
 
         action, plan = self._planner.plan(judge, self._plan, self._generator)
         self._plan = shift(plan)

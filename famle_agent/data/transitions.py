@@ -34,6 +34,7 @@ class Transitions:
         reward: (N, n).
         next_obs: (N, n, obs_dim).
         situations: What each situation is called, N of them.
+        terminated: Whether an episode ended by itself, (N, n); None where nobody knows, or none did.
 
     Raises:
         ValueError: Shapes do not fit, or a value is not finite.
@@ -44,6 +45,7 @@ class Transitions:
     reward: Array
     next_obs: Array
     situations: tuple[str, ...]
+    terminated: npt.NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.situations), self.obs.shape[1] if self.obs.ndim == 3 else -1)
@@ -55,6 +57,8 @@ class Transitions:
                 raise ValueError(f"{name} has shape {value.shape}; expected {shape} and the dimensions behind it.")
             if not np.isfinite(value).all():
                 raise ValueError(f"{name} holds values that are not finite; collect the transitions again.")
+        if self.terminated is not None and self.terminated.shape != shape:
+            raise ValueError(f"terminated has shape {self.terminated.shape}; expected {shape}.")
         if self.obs.shape != self.next_obs.shape:
             raise ValueError(f"obs {self.obs.shape} and next_obs {self.next_obs.shape} must have the same shape.")
 
@@ -68,7 +72,15 @@ class Transitions:
             raise ValueError(f"Transitions of {others.situations} cannot follow those of {self.situations}.")
         names = ("obs", "action", "reward", "next_obs")
         arrays = {name: np.concatenate([getattr(self, name), getattr(others, name)], axis=1) for name in names}
-        return Transitions(**arrays, situations=self.situations)
+        ended = None
+        if self.terminated is not None or others.terminated is not None:
+            ended = np.concatenate([self.ended, others.ended], axis=1)
+        return Transitions(**arrays, situations=self.situations, terminated=ended)
+
+    @property
+    def ended(self) -> npt.NDArray[np.bool_]:
+        """Whether an episode ended by itself, (N, n); nowhere, where nobody knows."""
+        return np.zeros(self.reward.shape, dtype=bool) if self.terminated is None else self.terminated
 
     def digest(self) -> str:
         """A short text that other transitions do not share."""
@@ -80,6 +92,8 @@ class Transitions:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a compressed NumPy archive; an older file stays whole until the new one is complete."""
         arrays = {name: getattr(self, name) for name in ("obs", "action", "reward", "next_obs")}
+        if self.terminated is not None:
+            arrays["terminated"] = self.terminated
         with whole_file(Path(path)) as partial, partial.open("wb") as file:
             np.savez_compressed(file, **arrays, situations=np.array(self.situations))
 
@@ -95,6 +109,7 @@ class Transitions:
             with np.load(path, allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in ("obs", "action", "reward", "next_obs")}
                 situations = tuple(str(name) for name in archive["situations"])
+                ended = archive.get("terminated")
         except (
             zipfile.BadZipFile,
             zlib.error,
@@ -105,4 +120,4 @@ class Transitions:
             ValueError,
         ) as error:
             raise ValueError(f"{path} holds no transitions, or not all of them; collect them again.") from error
-        return cls(**arrays, situations=situations)
+        return cls(**arrays, situations=situations, terminated=ended)

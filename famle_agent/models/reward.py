@@ -1,19 +1,39 @@
-"""Rewards: what they are to a planner, and one that is learnt where an environment does not say how it rewards."""
+"""What a planner maximises, and what of it is learnt where an environment does not say it: rewards and ends."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
 from famle_agent.models.observation import ObservationLayout
 
-__all__ = ["LearnedReward", "RewardFn"]
+__all__ = ["LearnedReward", "LearnedTermination", "Objective", "RewardFn", "TerminationFn"]
 
 RewardFn = Callable[[Tensor, Tensor, Tensor], Tensor]
 """r(s, a, s'): (..., obs_dim), (..., action_dim), (..., obs_dim) -> (...)."""
+
+TerminationFn = Callable[[Tensor], Tensor]
+"""Whether an episode ends in s', (..., obs_dim) -> (...)."""
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The return of a plan: sum of gamma^t r until an episode ends, and a value of where the plan does.
+
+    Attributes:
+        reward_fn: The reward of a transition.
+        termination_fn: Whether an episode ends in an observation; None where none ends by itself.
+        value_fn: What is still to come, (K, N, obs_dim) -> (K, N); None looks no further than the plan.
+        discount: gamma.
+    """
+
+    reward_fn: RewardFn
+    termination_fn: TerminationFn | None = None
+    value_fn: Callable[[Tensor], Tensor] | None = None
+    discount: float = 1.0
 
 
 class LearnedReward(nn.Module):
@@ -78,3 +98,54 @@ class LearnedReward(nn.Module):
 
     def _inputs(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
         return torch.cat([self._layout.features(obs), action, self._layout.features(next_obs)], dim=-1)
+
+
+class LearnedTermination(nn.Module):
+    """Whether an episode ends in s', as a network of its own.
+
+    Args:
+        layout: Of the observations.
+        width: Width of the two hidden layers.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, layout: ObservationLayout, width: int = 128) -> None:
+        super().__init__()
+        self._layout = replace(layout, pose_dims=())
+        inputs = self._layout.n_features
+        self.layers = nn.Sequential(
+            nn.Linear(inputs, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 1)
+        )
+        self.register_buffer("mean", torch.zeros(inputs))
+        self.register_buffer("std", torch.ones(inputs))
+
+    def forward(self, next_obs: Tensor) -> Tensor:
+        """Returns whether an episode ends, (...), in observations (..., obs_dim)."""
+        logit: Tensor = self.layers((self._layout.features(next_obs) - self.mean) / self.std)
+        return logit[..., 0] > 0.0
+
+    @torch.enable_grad()
+    def fit(
+        self, next_obs: Tensor, ended: Tensor, generator: torch.Generator, steps: int = 2000, batch_size: int = 256
+    ) -> None:
+        """Learns from observations with any leading axes; a quarter of each batch are ends, of which there are few."""
+        x, y = self._layout.features(next_obs).flatten(0, -2), ended.flatten().float()
+        self.mean.copy_(x.mean(dim=0))
+        std = x.std(dim=0)
+        self.std.copy_(torch.where(std > 1e-6, std, 1.0))
+        x, ends = (x - self.mean) / self.std, torch.where(y > 0.0)[0]
+        optimizer = torch.optim.Adam(self.parameters(), lr=1e-3)
+        for _ in range(steps):
+            sizes = batch_size - batch_size // 4, batch_size // 4
+            any_, some = (
+                torch.randint(n, (size,), generator=generator, device=generator.device).to(y.device)
+                for n, size in zip((len(y), len(ends)), sizes, strict=True)
+            )
+            i = torch.cat([any_, ends[some]])
+            loss = nn.functional.binary_cross_entropy_with_logits(self.layers(x[i])[:, 0], y[i])
+            optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            optimizer.step()
+        self.requires_grad_(False)

@@ -11,7 +11,7 @@ from torch import Tensor
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.network import Layers, Theta
 from famle_agent.models.observation import ObservationLayout
-from famle_agent.models.reward import RewardFn
+from famle_agent.models.reward import Objective
 
 __all__ = ["Simulator", "imagine"]
 
@@ -52,6 +52,16 @@ class Simulator:
             low, high = (bound.repeat_interleave(self._members, dim=0)[:, None] for bound in within)
             self._within = low, high
 
+    @property
+    def action_dim(self) -> int:
+        """Number of action dimensions."""
+        return self._model.action_dim
+
+    @property
+    def members(self) -> int:
+        """P, rows for each robot."""
+        return self._members
+
     def __call__(self, obs: Tensor, action: Tensor) -> Tensor:
         """Predicts the next observations in each member, (B, P, n, obs_dim), angles not wrapped.
 
@@ -67,18 +77,18 @@ class Simulator:
 
         return self._step(rows(obs), rows(action)).view(B, P, *obs.shape[-2:])
 
-    def returns(self, reward_fn: RewardFn, obs: Tensor, actions: Tensor) -> Tensor:
+    def returns(self, objective: Objective, obs: Tensor, actions: Tensor) -> Tensor:
         """Computes what candidate sequences of actions yield, (B, N), a mean over the members of the ensemble.
 
         A planner finds what a single model is wrong about; that several are wrong in the same way is rarer.
 
         Args:
-            reward_fn: The reward of a transition.
+            objective: What counts.
             obs: Where the robots are, (B, obs_dim).
             actions: Candidates in [-1, 1], (B, N, H, action_dim).
         """
         obs, actions = (values.repeat_interleave(self._members, dim=0) for values in (obs, actions))
-        of_members = imagine(self._step, reward_fn, obs, actions)  # (B * P, N)
+        of_members = imagine(self._step, objective, obs, actions)  # (B * P, N)
         return of_members.view(self._robots, self._members, -1).mean(dim=1)
 
     def _step(self, obs: Tensor, action: Tensor) -> Tensor:
@@ -91,12 +101,12 @@ class Simulator:
         return next_obs if self._within is None else next_obs.clamp(*self._within)
 
 
-def imagine(model: Callable[[Tensor, Tensor], Tensor], reward_fn: RewardFn, obs: Tensor, actions: Tensor) -> Tensor:
+def imagine(model: Callable[[Tensor, Tensor], Tensor], objective: Objective, obs: Tensor, actions: Tensor) -> Tensor:
     """Sums the rewards of candidate sequences in K models (the paper's eq. 13).
 
     Args:
         model: One step of many candidates: (K, N, obs_dim), (K, N, action_dim) -> next observations (K, N, obs_dim).
-        reward_fn: The reward of a transition.
+        objective: What counts.
         obs: Where the candidates begin, (K, obs_dim).
         actions: Candidates in [-1, 1], (K, N, H, action_dim).
 
@@ -104,18 +114,22 @@ def imagine(model: Callable[[Tensor, Tensor], Tensor], reward_fn: RewardFn, obs:
         The return of each candidate, (K, N); -inf where a model left the finite numbers.
     """
     at_once = max(1, _CANDIDATES_AT_ONCE.get(obs.device.type, 2500) // len(actions))
-    returns = [_imagine(model, reward_fn, obs, part) for part in torch.split(actions, at_once, dim=1)]
+    returns = [_imagine(model, objective, obs, part) for part in torch.split(actions, at_once, dim=1)]
     return torch.cat(returns, dim=1).nan_to_num(nan=-math.inf, posinf=-math.inf, neginf=-math.inf)
 
 
-def _imagine(model: Callable[[Tensor, Tensor], Tensor], reward_fn: RewardFn, obs: Tensor, actions: Tensor) -> Tensor:
+def _imagine(model: Callable[[Tensor, Tensor], Tensor], objective: Objective, obs: Tensor, actions: Tensor) -> Tensor:
     state = obs[:, None].expand(-1, actions.shape[1], -1)  # (K, N, obs_dim)
     total = torch.zeros(actions.shape[:2], device=obs.device)
+    weight: Tensor | float = 1.0  # gamma^t, and 0 once the episode has ended
     for action in actions.unbind(dim=2):
         next_state = model(state, action)
-        total = total + reward_fn(state, action, next_state)
+        total = total + weight * objective.reward_fn(state, action, next_state)
+        if objective.termination_fn is not None:
+            weight = weight * (1.0 - objective.termination_fn(next_state).to(total.dtype))
+        weight = weight * objective.discount
         state = next_state
-    return total
+    return total if objective.value_fn is None else total + weight * objective.value_fn(state)
 
 
 def _in_units_of_the_environment(model: Dynamics, layers: Layers) -> Layers:

@@ -49,6 +49,10 @@ class RunFolder:
         """The folder of a round's transitions."""
         return self._path and self._path / f"round-{round_}"
 
+    def search(self) -> tuple[Path | None, Path | None]:
+        """The files of a policy search: its transitions, and its weights, which are written last."""
+        return self._path and self._path / "policy.npz", self._path and self._path / "policy.safetensors"
+
     def progress(self, round_: int, stage: str) -> Path | None:
         """The file of how far a stage of a round's learning has got."""
         return self._path and self._path / f"round-{round_}-{stage}.pt"

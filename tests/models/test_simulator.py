@@ -12,6 +12,7 @@ from torch import Tensor
 
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.members import for_robots
+from famle_agent.models.reward import Objective
 from famle_agent.models.simulator import Simulator, imagine
 from tests.helpers import models, random_h, random_theta, random_transitions
 
@@ -98,7 +99,7 @@ def test_return_is_the_mean_over_members_of_the_sum_of_rewards(
         own = actions[:, None, :, t].expand(-1, model.members, -1, -1)
         state = model.predict(state, own, h, model.theta_of(robots))
         expected += last_position(obs, own, state)
-    found = Simulator(model, h).returns(last_position, obs, actions)
+    found = Simulator(model, h).returns(Objective(last_position), obs, actions)
     torch.testing.assert_close(found, expected.mean(dim=1), rtol=1e-6, atol=1e-6)
 
 
@@ -110,7 +111,7 @@ def test_one_member_that_diverges_is_enough(bad: float) -> None:
     theta = {name: value.clone() for name, value in model.theta_of(2).items()}
     theta["bias_0"][0, 1] = bad
     simulator = Simulator(model, model.embeddings_of(torch.zeros(2, dtype=torch.long)), theta)
-    returns = simulator.returns(last_position, torch.zeros(2, 2), torch.zeros(2, 3, 4, 1))
+    returns = simulator.returns(Objective(last_position), torch.zeros(2, 2), torch.zeros(2, 3, 4, 1))
     assert (returns[0] == -math.inf).all()
     assert returns[1].isfinite().all()
 
@@ -120,8 +121,8 @@ def test_many_candidates_are_judged_as_a_few() -> None:
     model = Dynamics(2, 2, n_situations=1, members=2)
     simulator = Simulator(model, model.embeddings_of(torch.zeros(2, dtype=torch.long)))
     obs, actions = torch.randn(2, 2), torch.rand(2, 1500, 2, 2)
-    together = simulator.returns(last_position, obs, actions)
-    parts = [simulator.returns(last_position, obs, part) for part in actions.split(100, dim=1)]
+    together = simulator.returns(Objective(last_position), obs, actions)
+    parts = [simulator.returns(Objective(last_position), obs, part) for part in actions.split(100, dim=1)]
     torch.testing.assert_close(together, torch.cat(parts, dim=1))
 
 
@@ -144,11 +145,11 @@ def test_return_is_the_sum_of_the_rewards() -> None:
             for action in actions[b, n]:
                 expected[b, n] += state.sum() + 10 * action.sum()
                 state = point_mass(state, action)
-    torch.testing.assert_close(imagine(point_mass, reward, obs, actions), expected)
+    torch.testing.assert_close(imagine(point_mass, Objective(reward), obs, actions), expected)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_return_that_is_no_number_is_the_worst(bad: float) -> None:
     actions = torch.tensor([[[[bad]], [[0.0]]]])
-    total = imagine(point_mass, lambda obs, action, next_obs: action[..., 0], torch.zeros(1, 1), actions)
+    total = imagine(point_mass, Objective(lambda obs, action, next_obs: action[..., 0]), torch.zeros(1, 1), actions)
     assert total.tolist() == [[-math.inf, 0.0]]

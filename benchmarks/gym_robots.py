@@ -1,0 +1,296 @@
+"""Gymnasium's robots with faults that nobody has seen, and no setting changed for any of them.
+
+python -m benchmarks.gym_robots                               # all beds, three meta-trainings each
+python -m benchmarks.gym_robots --beds halfcheetah --seeds 5
+
+The beds are those of the field (GrBAL: Nagabandi et al., 2019; CaDM: Lee et al., 2020; T-MCL: Seo et al., 2020), with
+the faults of motors for the others. Each robot lives one episode, its first.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import torch
+
+from benchmarks.methods import from_cache
+from benchmarks.results import Result, load
+from benchmarks.runner import Batch, Options, launch, run_batches
+from famle_agent import AMPC, AMPCMAML, FAMLE, FAMLEWrapper, ModelBasedAgent
+from famle_agent.data.action_scaling import to_action_space
+from famle_agent.models.actor_critic import ActorCritic
+from famle_agent.training.policy_search import PolicySearch, Search
+from famle_envs.faults import FaultWrapper
+
+Env = gym.Env[Any, Any]
+Make = Callable[[], Env]
+
+
+def faulty(env_id: str, situation: str, steps: int, **kwargs: Any) -> gym.Env[Any, Any]:
+    """Makes a robot that is broken."""
+    return FaultWrapper(gym.make(env_id, max_episode_steps=steps, **kwargs), situation)
+
+
+class Hanging(gym.Wrapper[Any, Any, Any, Any]):
+    """A pendulum of another mass and length, which begins at rest below, as CaDM has it."""
+
+    def __init__(self, mass: float, length: float) -> None:
+        super().__init__(gym.make("Pendulum-v1"))
+        self.unwrapped.m, self.unwrapped.l = mass, length  # type: ignore[attr-defined]
+
+    def reset(self, **kwargs: Any) -> Any:
+        """Resets it to where it hangs."""
+        _, info = self.env.reset(**kwargs)
+        self.unwrapped.state = np.array([np.pi, 0.0])  # type: ignore[attr-defined]
+        return np.array([-1.0, 0.0, 0.0], dtype=np.float32), info
+
+
+@dataclass(frozen=True)
+class Bed:
+    """A robot, what is wrong with it in training, and what nobody has told it.
+
+    Attributes:
+        train: Environments by situation, the intact one first.
+        test: Environments of unseen robots.
+    """
+
+    train: Mapping[str, Make]
+    test: Mapping[str, Make]
+
+
+def motors(env_id: str, steps: int, train: tuple[str, ...], test: tuple[str, ...], **kwargs: Any) -> Bed:
+    """Describes a bed of broken motors."""
+    make = {name: partial(faulty, env_id, name, steps, **kwargs) for name in ("intact", *train, *test)}
+    return Bed({name: make[name] for name in ("intact", *train)}, {name: make[name] for name in test})
+
+
+def every_motor(n: int, fault: str) -> tuple[str, ...]:
+    """Names one fault of each motor."""
+    return tuple(f"motor {i} {fault}" for i in range(n))
+
+
+def pendulum() -> Bed:
+    """Describes CaDM's: mass and length out of range."""
+    train = {f"mass {m}, length {x}": partial(Hanging, m, x) for m, x in product((1.0, 0.75, 1.25), repeat=2)}
+    train = {"intact": train.pop("mass 1.0, length 1.0"), **train}
+    unseen = ((0.3, 1.7), (0.6, 1.4), (1.4, 0.6), (1.7, 0.3))
+    return Bed(train, {f"mass {m}, length {x}": partial(Hanging, m, x) for m, x in unseen})
+
+
+BEDS: Mapping[str, Callable[[], Bed]] = {
+    "halfcheetah": lambda: motors(
+        "HalfCheetah-v5",
+        500,
+        every_motor(4, "dead"),
+        ("motor 4 dead", "motor 5 dead", "motor 0 dead, motor 4 dead", "motor 1 dead, motor 3 dead"),
+    ),
+    "ant": lambda: motors(
+        "Ant-v5",
+        500,
+        tuple(f"motor {2 * i} dead, motor {2 * i + 1} dead" for i in range(3)),
+        ("motor 6 dead, motor 7 dead",),
+        include_cfrc_ext_in_observation=False,
+    ),
+    "invertedpendulum": lambda: motors(
+        "InvertedPendulum-v5",
+        1000,
+        ("motor 0 at gain 0.5", "motor 0 at gain 1.5", "motor 0 reversed"),
+        ("motor 0 at gain 0.25", "motor 0 at gain 1.75", "motor 0 at gain -0.7"),
+    ),
+    "pendulum": pendulum,
+    "pusher": lambda: motors(
+        "Pusher-v5",
+        100,
+        every_motor(7, "dead") + every_motor(7, "reversed"),
+        (
+            "motor 0 reversed, motor 3 dead",
+            "motor 1 at gain 0.3, motor 5 reversed",
+            "motor 0 reversed, motor 3 reversed",
+        ),
+    ),
+    "reacher": lambda: motors(
+        "Reacher-v5",
+        50,
+        every_motor(2, "dead") + every_motor(2, "reversed"),
+        ("motor 0 at gain 0.3", "motor 0 reversed, motor 1 reversed", "motor 0 at gain -0.5, motor 1 at gain 0.5"),
+    ),
+    "hopper": lambda: motors(
+        "Hopper-v5",
+        500,
+        every_motor(3, "at gain 0.5") + every_motor(3, "dead"),
+        ("motor 0 at gain 0.3", "motor 1 at gain 0.3", "motor 2 at gain 0.3"),
+    ),
+    "walker2d": lambda: motors(
+        "Walker2d-v5",
+        500,
+        every_motor(6, "dead"),
+        ("motor 0 at gain 0.3", "motor 4 at gain 0.3", "motor 2 dead, motor 5 dead"),
+    ),
+}
+"""Test beds by name."""
+
+
+METHODS = ("famle", "famle-frozen", "famle-unguided", "famle-actor", "sac", "ampc-reptile", "ampc", "nothing", "random")
+"""FAMLE, without adaptation, without its policy, its policy alone; SAC on all training robots; the rivals; neither."""
+
+
+@dataclass(frozen=True)
+class Args(Options):
+    """Robots of Gymnasium with faults that nobody has seen."""
+
+    beds: tuple[str, ...] = tuple(BEDS)
+    """Test beds."""
+    methods: tuple[str, ...] = METHODS
+    """What is compared; FAMLE first, whose meta-training the others share."""
+    seeds: int = 3
+    """Independent meta-trainings."""
+
+
+class Actor:
+    """What chooses actions on a robot, by its observations: at random, unless a heir does better."""
+
+    def begin(self, env: Env) -> Env:
+        """Takes over a new robot, whose actions it is to choose."""
+        self.space: Any = env.action_space
+        return env
+
+    def __call__(self, obs: Any) -> Any:
+        """Chooses an action."""
+        return self.space.sample()
+
+
+class Nothing(Actor):
+    """Does nothing."""
+
+    def __call__(self, obs: Any) -> Any:
+        """Chooses 0."""
+        return np.zeros(self.space.shape, self.space.dtype)
+
+
+class Planner(Actor):
+    """One of our agents, which knows nothing of the last robot."""
+
+    def __init__(self, agent: ModelBasedAgent) -> None:
+        self.agent = agent
+
+    def begin(self, env: Env) -> Env:
+        """Takes over a new robot, and watches it."""
+        self.agent.forget()
+        self.agent.set_random_seed(0)
+        return FAMLEWrapper(env, self.agent)
+
+    def __call__(self, obs: Any) -> Any:
+        """Plans."""
+        return self.agent.predict(obs)[0]
+
+
+class Policy(Actor):
+    """A policy that is told nothing of the situation."""
+
+    def __init__(self, actor_critic: ActorCritic) -> None:
+        self.actor_critic = actor_critic
+
+    @torch.no_grad()
+    def __call__(self, obs: Any) -> Any:
+        """Does as it has learnt."""
+        numbers = torch.as_tensor(np.asarray(obs), dtype=torch.float32)
+        return to_action_space(self.actor_critic.act(numbers, torch.tensor(-1)), self.space)
+
+
+def agent_of(method: str, name: str, seed: int, cache: Path) -> ModelBasedAgent:
+    """Makes an agent with nothing changed but what its name says; what it meta-learns is kept."""
+    train = BEDS[name]().train
+    make = {"ampc": AMPC, "ampc-reptile": AMPCMAML}.get(method, FAMLE)
+    agent = make(train["intact"](), seed=seed, device="cpu")
+    path = cache / f"gym-{name}-{make.__name__}-{seed}.zip"
+    agent = from_cache(agent, path, lambda agent: agent.meta_learn(train))
+    if method == "famle-frozen":
+        agent.config = agent.config.changed(adapt_every=0)
+    if method == "famle-unguided" and agent.policy.world is not None:
+        agent.policy.world = replace(agent.policy.world, actor_critic=None)
+    return agent
+
+
+def randomised_sac(name: str, seed: int) -> ActorCritic:
+    """Trains Stable-Baselines3's SAC as FAMLE does, on the same robots, but tells it never which one it is on."""
+    train = BEDS[name]().train
+    settings = FAMLE(train["intact"]()).config.simulation.policy or PolicySearch()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        search = Search(replace(settings, untold=1.0), list(train.values()), list(train), seed)
+        for _ in search.run():
+            pass
+    search.close()
+    return search.actor_critic()
+
+
+def actor_of(method: str, name: str, seed: int, cache: Path) -> Actor:
+    """Makes what chooses the actions."""
+    if method in ("nothing", "random"):
+        return Nothing() if method == "nothing" else Actor()
+    if method == "sac":
+        return Policy(randomised_sac(name, seed))
+    agent = agent_of(method, name, seed, cache)
+    world = agent.policy.world
+    if method == "famle-actor" and world is not None and world.actor_critic is not None:
+        return Policy(world.actor_critic)
+    return Planner(agent)
+
+
+def episode(env: Env, actor: Actor, seed: int) -> tuple[float, list[float]]:
+    """Runs the first episode of a robot; returns its return, and the seconds that each action took to choose."""
+    env = actor.begin(env)
+    env.action_space.seed(seed)
+    (obs, _), total, seconds, ended = env.reset(seed=seed), 0.0, list[float](), False
+    while not ended:
+        start = time.perf_counter()
+        action = actor(obs)
+        seconds.append(time.perf_counter() - start)
+        obs, reward, terminated, truncated, _ = env.step(action)
+        total, ended = total + float(reward), terminated or truncated
+    env.close()
+    return total, seconds
+
+
+def run(method: str, name: str, seed: int, cache: Path) -> list[Result]:
+    """Runs a method of one meta-training on all unseen robots."""
+    start = time.process_time()
+    actor = actor_of(method, name, seed, cache)
+    learning = time.process_time() - start
+    returns, steps, choosing = dict[str, float](), dict[str, int](), list[float]()
+    for robot, make in BEDS[name]().test.items():
+        returns[robot], seconds = episode(make(), actor, 1000 + seed)
+        steps[robot] = len(seconds)
+        choosing += seconds
+    milliseconds = 1e3 * float(np.median(choosing))
+    return [{"cpu_seconds": learning, "returns": returns, "steps": steps, "ms_per_step": milliseconds}]
+
+
+def main(args: Args) -> None:
+    """Runs what is not stored, and prints medians over meta-trainings and unseen robots."""
+    for name in args.beds:
+        table = args.out / f"gym-{name}.csv"
+        for method in args.methods:
+            batches = [
+                Batch(method, (seed,), partial(run, method, name, seed, args.cache)) for seed in range(args.seeds)
+            ]
+            run_batches(batches, table, args.jobs, args.backend)
+        results = load(table)
+        returns = pd.DataFrame(list(results["returns"]), index=results["method"])
+        medians = returns.groupby(level=0).median()
+        medians["all"] = returns.T.median().groupby(level=0).median()
+        print(f"\n{name}: return of the first episode, medians over {args.seeds} meta-trainings")
+        print(medians.loc[[method for method in METHODS if method in medians.index]].round(1).to_string())
+
+
+if __name__ == "__main__":
+    launch(main, Args)

@@ -1,0 +1,78 @@
+"""What to do in each situation and what it is worth, as learnt in simulation: a planner's candidates and far sight."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["ActorCritic"]
+
+_FAR = 10.0  # deviations beyond which an observation says no more
+
+
+class ActorCritic(nn.Module):
+    """An actor and critics that are told the situation as a one-hot vector beside the observation.
+
+    A situation index of -1 is a robot whose situation is not told. Inputs are normalised, one-hot vectors included, so
+    that 0 is the mean of all situations; this is what is put in for those that are not told.
+
+    Args:
+        obs_dim: Number of observation dimensions.
+        action_dim: Number of action dimensions.
+        n_situations: N.
+        hidden: Width of each hidden layer.
+        critics: Number of critics.
+
+    Attributes:
+        value_scale: What the critics' values are to be multiplied by to be sums of rewards.
+        discount: gamma of these sums.
+    """
+
+    mean: Tensor
+    std: Tensor
+    value_scale: Tensor
+    discount: Tensor
+
+    def __init__(
+        self, obs_dim: int, action_dim: int, n_situations: int, hidden: Sequence[int] = (192, 192), critics: int = 2
+    ) -> None:
+        super().__init__()
+        self.obs_dim, self.n_situations = obs_dim, n_situations
+        inputs = obs_dim + n_situations
+        self.actor = mlp([inputs, *hidden, action_dim])
+        self.critics = nn.ModuleList(mlp([inputs + action_dim, *hidden, 1]) for _ in range(critics))
+        self.register_buffer("mean", torch.zeros(inputs))
+        self.register_buffer("std", torch.ones(inputs))
+        self.register_buffer("value_scale", torch.ones(()))
+        self.register_buffer("discount", torch.ones(()))
+
+    def act(self, obs: Tensor, situation: Tensor) -> Tensor:
+        """Returns the actor's mean action in [-1, 1], (..., action_dim), for (..., obs_dim) in situations (...)."""
+        action: Tensor = self.actor(self._inputs(obs, situation))
+        return action.tanh()
+
+    def value(self, obs: Tensor, situation: Tensor) -> Tensor:
+        """Returns the discounted sum of rewards that the actor expects from here on, (...): a mean of the critics."""
+        x = self._inputs(obs, situation)
+        x = torch.cat([x, self.actor(x).tanh()], dim=-1)
+        values = torch.stack([critic(x)[..., 0] for critic in self.critics])
+        return values.mean(dim=0) * self.value_scale
+
+    def _inputs(self, obs: Tensor, situation: Tensor) -> Tensor:
+        mean, std = self.mean, self.std
+        seen = ((obs - mean[: self.obs_dim]) / std[: self.obs_dim]).clamp(-_FAR, _FAR)
+        told = nn.functional.one_hot(situation.clamp(min=0), self.n_situations).to(obs.dtype)
+        told = ((told - mean[self.obs_dim :]) / std[self.obs_dim :]).clamp(-_FAR, _FAR)
+        told = torch.where(situation[..., None] < 0, 0.0, told)
+        return torch.cat([seen, told.expand(*seen.shape[:-1], -1)], dim=-1)
+
+
+def mlp(sizes: Sequence[int]) -> nn.Sequential:
+    """Makes layers with rectifiers between them, as Stable-Baselines3 does."""
+    layers: list[nn.Module] = []
+    for fan_in, fan_out in pairwise(sizes):
+        layers += [nn.Linear(fan_in, fan_out), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
