@@ -107,9 +107,11 @@ def tiny_budgets(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shrinks what an agent spends by default, and the reacher's episodes; shipped models stay what they are."""
     tiny = {**QUICK, "transitions_per_situation": 40, "meta_iterations": 3, "inner_steps": 3}
     tiny |= {"rounds": 0, "joint_iterations": 2}
+    policy = {"policy_steps": 40, "policy_random_steps": 20, "policy_updates_per_step": 0.1, "policy_hidden": (8,)}
     for robot in known_robots().values():
         for mode in robot.modes.values():
-            for name, value in (tiny if robot.pretrained is None else QUICK).items():
+            small = tiny if robot.pretrained is None else QUICK
+            for name, value in (small | (policy if "policy_steps" in mode else {})).items():
                 monkeypatch.setitem(mode, name, value)
     monkeypatch.setattr(gym.spec("FamleReacher-v0"), "max_episode_steps", 6)
 

@@ -427,7 +427,7 @@ _ADAPTING = "adapt_every or adapt_at_reset"
 _NEEDS = {
     **dict.fromkeys(_NAMES[Rounds].values(), "rounds"),
     **dict.fromkeys(_NAMES[PolicySearch].values(), "policy_steps"),
-    **dict.fromkeys(("transitions_per_situation", "action_hold"), "no policy_steps"),
+    **dict.fromkeys(("transitions_per_situation", "action_hold"), "policy_steps=0"),
     **dict.fromkeys(_NAMES[JointTraining].values(), "joint_iterations"),
     **dict.fromkeys(_NAMES[InnerLoop].values(), "meta_iterations, or an adaptation that has no rate of its own"),
     **dict.fromkeys((*_META.values(), "meta_learner"), "meta_iterations"),

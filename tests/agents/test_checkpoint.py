@@ -78,7 +78,8 @@ def test_agent_that_learned_on_its_robot_goes_on(quick_agent: FAMLE, reload: Loa
 
 
 def test_learned_reward_is_kept(reload: Load) -> None:
-    agent = FAMLE("Pendulum-v1", seed=0, device="cpu", hidden=(8,), transitions_per_situation=30, meta_iterations=2)
+    small = {"hidden": (8,), "policy_steps": 0, "transitions_per_situation": 30, "joint_iterations": 2}
+    agent = FAMLE("Pendulum-v1", seed=0, device="cpu", **small)
     agent.meta_learn([lambda g=g: gym.make("Pendulum-v1", g=g) for g in (3.0, 10.0)])
     obs = np.array([1.0, 0.0, 0.5], dtype=np.float32)
     np.testing.assert_array_equal(actions(reload(agent), obs=obs), actions(agent, obs=obs))

@@ -176,6 +176,7 @@ def test_pendulum_needs_no_situation(make_env: MakeEnv) -> None:
         seed=0,
         device="cpu",
         hidden=(8,),
+        policy_steps=0,
         transitions_per_situation=30,
         meta_iterations=2,
         adapt_every=2,

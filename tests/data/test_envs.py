@@ -23,10 +23,14 @@ MakeEnv = Callable[..., gym.Env[Any, Any]]
 GRAVITIES = (2.0, 10.0)
 SMALL: dict[str, Any] = {
     "hidden": (32,),
+    "policy_steps": 0,
     "transitions_per_situation": 200,
+    "joint_iterations": 0,
     "meta_iterations": 40,
     "inner_steps": 10,
     "candidates": 30,
+    "planner_iterations": 3,
+    "init_std": 0.5,
     "adapt_every": 5,
     "adapt_steps": 2,
 }

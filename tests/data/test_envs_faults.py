@@ -20,18 +20,18 @@ MakeEnv = Callable[..., gym.Env[Any, Any]]
 
 
 def pendulum(**kwargs: Any) -> FAMLE:
-    return FAMLE("Pendulum-v1", seed=0, device="cpu", hidden=(32,), inner_steps=10, **kwargs)
+    return FAMLE("Pendulum-v1", seed=0, device="cpu", hidden=(32,), joint_iterations=2, **{"policy_steps": 0, **kwargs})
 
 
 def test_keys_of_a_mapping_name_the_situations(make_env: MakeEnv) -> None:
-    agent = pendulum(transitions_per_situation=4)
+    agent = pendulum(policy_steps=0, transitions_per_situation=4)
     planets = {"earth": lambda: gym.make("Pendulum-v1"), "moon": make_env("Pendulum-v1", g=1.6)}
     faults = {"lame": Situation(motor_gain=(0.5,), name="not this"), "dead": "motor 0 dead", "on": {"motor_stuck": [1]}}
     assert agent.collect({**planets, **faults}).situations == ("earth", "moon", "lame", "dead", "on")
 
 
 def test_names_are_what_the_agent_believes_in() -> None:
-    agent = pendulum(transitions_per_situation=20, meta_iterations=2)
+    agent = pendulum(policy_steps=0, transitions_per_situation=20)
     agent.meta_learn({"earth": lambda: gym.make("Pendulum-v1"), "moon": lambda: gym.make("Pendulum-v1", g=1.6)})
     assert agent.situations == ("earth", "moon")
     assert list(agent.posterior()) == ["earth", "moon"]
@@ -39,7 +39,7 @@ def test_names_are_what_the_agent_believes_in() -> None:
 
 @pytest.mark.parametrize("robot", ["Pendulum-v1", "InvertedPendulum-v5"])
 def test_foreign_robot_breaks_as_ours_do(robot: str) -> None:
-    agent = FAMLE(robot, seed=0, device="cpu", transitions_per_situation=20)
+    agent = FAMLE(robot, seed=0, device="cpu", policy_steps=0, transitions_per_situation=20)
     data = agent.collect(["motor 0 dead", Situation(motor_stuck=(1.0,))])
     assert data.situations == ("joint 0 dead", "motor 0 stuck at 1")
     speed = np.abs(data.obs[..., -1]).mean(axis=1)
@@ -66,7 +66,7 @@ def test_broken_robot_keeps_its_task_and_its_angles(monkeypatch: pytest.MonkeyPa
 
 def test_broken_robot_is_trained_on_the_faults_of_its_motors(make_env: MakeEnv) -> None:
     env = FaultWrapper(make_env("Pendulum-v1"), "sensor 0 off by 0.1")
-    agent = FAMLE(env, seed=0, device="cpu", transitions_per_situation=4)
+    agent = FAMLE(env, seed=0, device="cpu", policy_steps=0, transitions_per_situation=4)
     names = ("intact", "joint 0 dead", "joint 0 at gain 0.5", "joint 0 reversed")
     assert agent.collect().situations == names
     assert agent.collect(["sensor 1 frozen"], n_jobs=2).situations == ("sensor 1 frozen",)
