@@ -103,11 +103,11 @@ BEDS: Mapping[str, Callable[[], Bed]] = {
     "invertedpendulum": lambda: motors(
         "InvertedPendulum-v5",
         1000,
-        (*(f"motor 0 strength x {f}, body 2 mass x {m}" for f in (0.5, 1.5) for m in (0.8, 1.2)), "motor 0 reversed"),
+        (*(f"motor 0 strength x {f}, body 1 mass x {m}" for f in (0.5, 1.5) for m in (0.8, 1.2)), "motor 0 reversed"),
         (
-            "motor 0 strength x 0.25, body 2 mass x 0.35",
-            "motor 0 strength x 1.75, body 2 mass x 1.6",
-            "motor 0 at gain -0.8, body 2 mass x 1.1",
+            "motor 0 strength x 0.25, body 1 mass x 0.35",
+            "motor 0 strength x 1.75, body 1 mass x 1.6",
+            "motor 0 at gain -0.8, body 1 mass x 1.1",
         ),
     ),
     "pendulum": pendulum,
