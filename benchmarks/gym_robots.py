@@ -9,6 +9,7 @@ the faults of motors for the others. Each robot lives one episode, its first.
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -157,6 +158,8 @@ class Args(Options):
     """What is compared; FAMLE first, whose meta-training the others share."""
     seeds: int = 3
     """Independent meta-trainings."""
+    change: tuple[str, ...] = ()
+    """Settings of FAMLE to change, such as policy_steps=100000; the table gets them into its name."""
 
 
 class Actor:
@@ -210,12 +213,13 @@ class Policy(Actor):
         return to_action_space(self.actor_critic.act(numbers, torch.tensor(-1)), self.space)
 
 
-def agent_of(method: str, name: str, seed: int, cache: Path) -> ModelBasedAgent:
+def agent_of(method: str, name: str, seed: int, cache: Path, change: tuple[str, ...]) -> ModelBasedAgent:
     """Makes an agent with nothing changed but what its name says; what it meta-learns is kept."""
     train = BEDS[name]().train
     make = {"ampc": AMPC, "ampc-reptile": AMPCMAML}.get(method, FAMLE)
-    agent = make(train["intact"](), seed=seed, device="cpu")
-    path = cache / f"gym-{name}-{make.__name__}-{seed}.zip"
+    settings = {key: json.loads(value) for key, _, value in (one.partition("=") for one in change)}
+    agent = make(train["intact"](), seed=seed, device="cpu", **(settings if make is FAMLE else {}))
+    path = cache / f"gym-{'-'.join((name, make.__name__, *change))}-{seed}.zip"
     agent = from_cache(agent, path, lambda agent: agent.meta_learn(train))
     if method == "famle-frozen":
         agent.config = agent.config.changed(adapt_every=0)
@@ -237,13 +241,13 @@ def randomised_sac(name: str, seed: int) -> ActorCritic:
     return search.actor_critic()
 
 
-def actor_of(method: str, name: str, seed: int, cache: Path) -> Actor:
+def actor_of(method: str, name: str, seed: int, cache: Path, change: tuple[str, ...]) -> Actor:
     """Makes what chooses the actions."""
     if method in ("nothing", "random"):
         return Nothing() if method == "nothing" else Actor()
     if method == "sac":
         return Policy(randomised_sac(name, seed))
-    agent = agent_of(method, name, seed, cache)
+    agent = agent_of(method, name, seed, cache, change)
     world = agent.policy.world
     if method == "famle-actor" and world is not None and world.actor_critic is not None:
         return Policy(world.actor_critic)
@@ -265,10 +269,10 @@ def episode(env: Env, actor: Actor, seed: int) -> tuple[float, list[float]]:
     return total, seconds
 
 
-def run(method: str, name: str, seed: int, cache: Path) -> list[Result]:
+def run(method: str, name: str, seed: int, cache: Path, change: tuple[str, ...]) -> list[Result]:
     """Runs a method of one meta-training on all unseen robots."""
     start = time.process_time()
-    actor = actor_of(method, name, seed, cache)
+    actor = actor_of(method, name, seed, cache, change)
     learning = time.process_time() - start
     returns, steps, choosing = dict[str, float](), dict[str, int](), list[float]()
     for robot, make in BEDS[name]().test.items():
@@ -282,10 +286,11 @@ def run(method: str, name: str, seed: int, cache: Path) -> list[Result]:
 def main(args: Args) -> None:
     """Runs what is not stored, and prints medians over meta-trainings and unseen robots."""
     for name in args.beds:
-        table = args.out / f"gym-{name}.csv"
+        table = args.out / f"gym-{'-'.join((name, *args.change))}.csv"
         for method in args.methods:
             batches = [
-                Batch(method, (seed,), partial(run, method, name, seed, args.cache)) for seed in range(args.seeds)
+                Batch(method, (seed,), partial(run, method, name, seed, args.cache, args.change))
+                for seed in range(args.seeds)
             ]
             run_batches(batches, table, args.jobs, args.backend)
         results = load(table)

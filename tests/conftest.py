@@ -107,7 +107,7 @@ def tiny_budgets(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shrinks what an agent spends by default, and the reacher's episodes; shipped models stay what they are."""
     tiny = {**QUICK, "transitions_per_situation": 40, "meta_iterations": 3, "inner_steps": 3}
     tiny |= {"rounds": 0, "joint_iterations": 2}
-    policy = {"policy_steps": 40, "policy_random_steps": 20, "policy_updates_per_step": 0.1, "policy_hidden": (8,)}
+    policy = {"policy_steps": 120, "policy_random_steps": 20, "policy_updates_per_step": 0.1, "policy_hidden": (8,)}
     for robot in known_robots().values():
         for mode in robot.modes.values():
             small = tiny if robot.pretrained is None else QUICK

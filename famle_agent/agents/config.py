@@ -316,7 +316,6 @@ _NAMES: dict[type, dict[str, str]] = {
     },
     PolicySearch: {
         "steps": "policy_steps",
-        "total_steps": "policy_total_steps",
         "updates_per_step": "policy_updates_per_step",
         "batch_size": "policy_batch_size",
         "lr": "policy_lr",

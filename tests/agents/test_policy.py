@@ -17,7 +17,7 @@ from tests.training.test_policy_search import Reach
 
 TINY: dict[str, Any] = {
     "device": "cpu",
-    "policy_steps": 60,
+    "policy_steps": 180,
     "policy_updates_per_step": 0.1,
     "policy_batch_size": 8,
     "policy_hidden": (8,),
