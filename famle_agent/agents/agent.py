@@ -365,7 +365,10 @@ class ModelBasedAgent(BaseAlgorithm):
             )
 
     def collect(self, envs: SituationsLike | None = None, progress_bar: bool = False, n_jobs: int = 1) -> Transitions:
-        """Collects the random transitions that :meth:`meta_learn` learns from; arguments as there."""
+        """Collects random transitions in every situation; arguments as of :meth:`meta_learn`.
+
+        They are what that learns from, but where it learns a policy first (``policy_steps``).
+        """
         source = self.situation_envs(envs)
         n = self.config.simulation.transitions_per_situation * len(source.sources)
         with tqdm(total=n, desc="Simulating", unit="step", mininterval=1.0, disable=not progress_bar) as bar:

@@ -87,6 +87,8 @@ class Transitions:
         digest = hashlib.sha256(repr(self.situations).encode())
         for values in (self.obs, self.action, self.reward, self.next_obs):
             digest.update(np.ascontiguousarray(values).tobytes())
+        if self.terminated is not None:
+            digest.update(self.terminated.tobytes())
         return digest.hexdigest()[:16]
 
     def save(self, path: str | os.PathLike[str]) -> None:
