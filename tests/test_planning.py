@@ -225,3 +225,22 @@ def test_shift_moves_on_and_repeats_the_last_action() -> None:
     tau = torch.arange(6.0).view(1, 3, 2)
     assert shift(tau).tolist() == [[[2.0, 3.0], [4.0, 5.0], [4.0, 5.0]]]
     assert torch.equal(shift(tau[:, :1]), tau[:, :1])
+
+
+# --- proposals --------------------------------------------------------------------------------------------
+
+
+@every_planner
+@given(seed=st.integers(0, 1000))
+def test_plan_that_somebody_proposes_competes(make: Make, seed: int) -> None:
+    """The only plan that is worth anything is found, which no planner would find by itself."""
+    planner, chance = make(6), generator(seed)
+    needle = 2.0 * torch.rand(2, 1, 6, 2, generator=chance) - 1.0
+
+    def judge(tau: Tensor) -> Tensor:
+        return -1e3 * (tau - needle).square().sum(dim=(2, 3))
+
+    hay = 2.0 * torch.rand(2, 3, 6, 2, generator=chance) - 1.0
+    proposals = torch.cat([hay, needle], dim=1)
+    action, _ = planner.plan(judge, torch.zeros(2, 6, 2), chance, proposals)
+    torch.testing.assert_close(action, needle[:, 0, 0], atol=0.05, rtol=0.0)

@@ -219,3 +219,14 @@ def test_damaged_file_in_the_folder_is_named(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:50])
     with pytest.raises(ValueError, match=r"situation-001\.npz holds no transitions, or not all of them"):
         collected(folder=tmp_path)
+
+
+@pytest.mark.parametrize("terminates", [True, False])
+def test_ends_of_episodes_are_kept(terminates: bool, tmp_path: Path) -> None:
+    data = collected(n=11, envs=[Clock(4, terminates), Clock(100, terminates)])
+    expected = np.zeros((2, 11), dtype=bool)
+    expected[0, 3::4] = terminates  # a time limit is no end
+    np.testing.assert_array_equal(data.ended, expected)
+    data.save(tmp_path / "data.npz")
+    np.testing.assert_array_equal(Transitions.load(tmp_path / "data.npz").ended, expected)
+    np.testing.assert_array_equal(data.followed_by(data).ended, np.concatenate([expected, expected], axis=1))

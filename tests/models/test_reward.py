@@ -7,7 +7,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 
 from famle_agent import FAMLE
 from famle_agent.models.observation import ObservationLayout
-from famle_agent.models.reward import LearnedReward
+from famle_agent.models.reward import LearnedReward, LearnedTermination
 
 
 def test_dimension_that_never_changes_is_not_blown_up() -> None:
@@ -28,3 +28,17 @@ def test_callbacks_let_an_agent_act_while_it_learns_its_reward() -> None:
     watch = EvalCallback(gym.make("Pendulum-v1", max_episode_steps=5), eval_freq=1, n_eval_episodes=1, verbose=0)
     agent.meta_learn([lambda: gym.make("Pendulum-v1")], callback=watch, check=False)
     assert np.isfinite(watch.last_mean_reward)
+
+
+def test_ends_of_episodes_are_learnt_though_they_are_rare() -> None:
+    chance = torch.Generator().manual_seed(0)
+    obs = torch.randn(2, 3000, 3, generator=chance)
+    ended = obs[..., 1] > 2.0
+    assert 0.01 < ended.float().mean() < 0.04
+    learned = LearnedTermination(ObservationLayout(3))
+    learned.fit(obs, ended, chance, steps=800)
+    unseen = torch.randn(5000, 3, generator=chance)
+    true, found = unseen[:, 1] > 2.0, learned(unseen)
+    assert found.dtype == torch.bool
+    assert found[true].float().mean() > 0.85
+    assert found[~true].float().mean() < 0.03
