@@ -62,16 +62,20 @@ class Guide:
         return torch.stack(actions, dim=2)
 
     def looking_beyond(self, objective: Objective, likely: Tensor, members: int) -> Objective:
-        """Adds the critics' value of where a plan ends, in the most likely situation of each robot.
+        """Adds the critics' value of where a plan ends: the mean of the most likely situation's and of none's.
+
+        Where nothing like the robot was trained, the value of a situation is too high where its own policy does not go.
 
         Args:
             objective: What counts until then.
             likely: How likely each training situation is, (B, N).
             members: P, rows of the model for each robot.
         """
-        situation = likely.argmax(dim=1).repeat_interleave(members)[:, None]  # (B * P, 1)
+        likeliest = likely.argmax(dim=1).repeat_interleave(members)
+        told = torch.stack([likeliest, torch.full_like(likeliest, -1)])[..., None]  # (2, B * P, 1)
 
         def value(obs: Tensor) -> Tensor:
-            return self.actor_critic.value(obs, situation.expand(obs.shape[:2]))
+            values = self.actor_critic.value(obs.expand(2, *obs.shape), told.expand(2, *obs.shape[:2]))
+            return values.mean(dim=0)
 
         return replace(objective, value_fn=value, discount=float(self.actor_critic.discount))

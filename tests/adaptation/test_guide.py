@@ -36,15 +36,20 @@ def test_proposals_are_what_the_actor_would_do_in_the_likely_situations() -> Non
 
 
 @torch.no_grad()
-def test_value_of_the_most_likely_situation_lies_beyond_a_plan() -> None:
+def test_value_of_the_most_likely_situation_and_of_none_lies_beyond_a_plan() -> None:
     guide, model, obs = made()
     guide.actor_critic.discount.fill_(0.5)
     likely = torch.tensor([[0.1, 0.2, 0.7], [0.6, 0.1, 0.3]])
     objective = guide.looking_beyond(Objective(lambda s, a, s_next: s_next[..., 0]), likely, model.members)
-    actions = torch.randn(2, 3, 1, 1).clamp(-1.0, 1.0)
+    actions, untold = torch.randn(2, 3, 1, 1).clamp(-1.0, 1.0), torch.tensor(-1)
     found = model.returns(objective, obs, actions)
     after = model(obs[:, None].expand(-1, 3, -1), actions[:, :, 0])  # (2, P, 3, obs_dim)
-    values = torch.stack([guide.actor_critic.value(after[i], torch.tensor(c)) for i, c in enumerate((2, 0))])
+    values = torch.stack(
+        [
+            0.5 * (guide.actor_critic.value(after[i], torch.tensor(c)) + guide.actor_critic.value(after[i], untold))
+            for i, c in enumerate((2, 0))
+        ]
+    )
     torch.testing.assert_close(found, (after[..., 0] + 0.5 * values).mean(dim=1), rtol=1e-4, atol=1e-5)
 
 
