@@ -300,7 +300,8 @@ class ModelBasedAgent(BaseAlgorithm):
             callback: Stable-Baselines3 callbacks, or a function.
             tb_log_name: Name of the run in TensorBoard; by default the class and ``_meta``.
             progress_bar: Whether to show progress bars.
-            n_jobs: Processes that simulate, -1 for one a core. The result does not depend on it.
+            n_jobs: Processes that simulate, -1 for one a core. The result does not depend on it. A policy is learnt in
+                this process alone.
             folder: Where transitions are stored as they come, the model after each round, and once a minute how far
                 a round has got. The same call goes on where one that was stopped had got to.
             check: Whether to compare the agent's planning in simulation with doing nothing and acting at random in the
