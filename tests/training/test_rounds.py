@@ -198,7 +198,11 @@ def test_callback_ends_all_rounds(make_agent: Make, last: int, tmp_path: Path) -
 
 def test_reward_that_is_learned_judges_the_plans_of_a_round() -> None:
     """The reward network knows actions in [-1, 1]; the environment's go from -2 to 2."""
-    settings = TINY | ONE_ROUND | {"candidates": 40, "planner": "random_shooting", "planner_iterations": 0, "elites": 0}
+    settings = (
+        TINY
+        | ONE_ROUND
+        | {"policy_steps": 0, "candidates": 40, "planner": "random_shooting", "planner_iterations": 0, "elites": 0}
+    )
     agent = FAMLE("Pendulum-v1", device="cpu", seed=0, **settings)
     agent.meta_learn([lambda g=g: gym.make("Pendulum-v1", g=g) for g in (3.0, 10.0)])
     policy = agent.planning_policy()(agent.get_env().envs[0], 0, np.random.default_rng(0))
