@@ -78,6 +78,7 @@ class Search:
     Attributes:
         sac: Stable-Baselines3's soft actor-critic.
         reported: Simulated steps since the last report.
+        chance: The state of NumPy's global generator, from which Stable-Baselines3 draws.
     """
 
     def __init__(
@@ -104,7 +105,7 @@ class Search:
         envs = DummyVecEnv([lambda i=i: told(i) for i in range(n)])  # type: ignore[misc]
         envs.seed(seed)
         self._envs = VecNormalize(envs, gamma=settings.discount)
-        self._chance = np.random.RandomState(seed % 2**32).get_state()
+        self.chance: Any = np.random.RandomState(seed % 2**32).get_state()
         train_every = max(1, 50 // n)
         with _numpy_chance(self):
             self.sac = SAC(
@@ -173,15 +174,6 @@ class Search:
         """Closes the environments that were made for it."""
         for env in self._close:
             env.close()
-
-    @property
-    def chance(self) -> Any:
-        """The state of NumPy's global generator, from which Stable-Baselines3 draws."""
-        return self._chance
-
-    @chance.setter
-    def chance(self, state: Any) -> None:
-        self._chance = state
 
 
 class _Told(gym.ObservationWrapper[Any, Any, Any]):
