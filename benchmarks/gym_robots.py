@@ -213,13 +213,23 @@ class Policy(Actor):
         return to_action_space(self.actor_critic.act(numbers, torch.tensor(-1)), self.space)
 
 
+def kind_of(method: str) -> type[ModelBasedAgent]:
+    """Returns the class of a method's agent."""
+    return {"ampc": AMPC, "ampc-reptile": AMPCMAML}.get(method, FAMLE)
+
+
+def cached_at(method: str, name: str, seed: int, cache: Path, change: tuple[str, ...]) -> Path:
+    """Returns where what a method meta-learns is kept, which FAMLE and its variants share."""
+    return cache / f"gym-{'-'.join((name, kind_of(method).__name__, *change))}-{seed}.zip"
+
+
 def agent_of(method: str, name: str, seed: int, cache: Path, change: tuple[str, ...]) -> ModelBasedAgent:
     """Makes an agent with nothing changed but what its name says; what it meta-learns is kept."""
     train = BEDS[name]().train
-    make = {"ampc": AMPC, "ampc-reptile": AMPCMAML}.get(method, FAMLE)
+    make = kind_of(method)
     settings = {key: json.loads(value) for key, _, value in (one.partition("=") for one in change)}
     agent = make(train["intact"](), seed=seed, device="cpu", **(settings if make is FAMLE else {}))
-    path = cache / f"gym-{'-'.join((name, make.__name__, *change))}-{seed}.zip"
+    path = cached_at(method, name, seed, cache, change)
     agent = from_cache(agent, path, lambda agent: agent.meta_learn(train))
     if method == "famle-frozen":
         agent.config = agent.config.changed(adapt_every=0)
@@ -241,6 +251,11 @@ def randomised_sac(name: str, seed: int) -> ActorCritic:
     return search.actor_critic()
 
 
+def is_learnt(method: str, name: str, seed: int, cache: Path, change: tuple[str, ...]) -> bool:
+    """Tells whether what a method meta-learns is in the cache, so that nothing can be said of the time it takes."""
+    return method not in ("sac", "nothing", "random") and cached_at(method, name, seed, cache, change).exists()
+
+
 def actor_of(method: str, name: str, seed: int, cache: Path, change: tuple[str, ...]) -> Actor:
     """Makes what chooses the actions."""
     if method in ("nothing", "random"):
@@ -248,10 +263,12 @@ def actor_of(method: str, name: str, seed: int, cache: Path, change: tuple[str, 
     if method == "sac":
         return Policy(randomised_sac(name, seed))
     agent = agent_of(method, name, seed, cache, change)
+    if method != "famle-actor":
+        return Planner(agent)
     world = agent.policy.world
-    if method == "famle-actor" and world is not None and world.actor_critic is not None:
-        return Policy(world.actor_critic)
-    return Planner(agent)
+    if world is None or world.actor_critic is None:
+        raise ValueError("This agent has learnt no policy; leave out famle-actor, or give it policy_steps.")
+    return Policy(world.actor_critic)
 
 
 def episode(env: Env, actor: Actor, seed: int) -> tuple[float, list[float]]:
@@ -271,9 +288,9 @@ def episode(env: Env, actor: Actor, seed: int) -> tuple[float, list[float]]:
 
 def run(method: str, name: str, seed: int, cache: Path, change: tuple[str, ...]) -> list[Result]:
     """Runs a method of one meta-training on all unseen robots."""
-    start = time.process_time()
+    known, start = is_learnt(method, name, seed, cache, change), time.process_time()
     actor = actor_of(method, name, seed, cache, change)
-    learning = time.process_time() - start
+    learning = None if known else time.process_time() - start
     returns, steps, choosing = dict[str, float](), dict[str, int](), list[float]()
     for robot, make in BEDS[name]().test.items():
         returns[robot], seconds = episode(make(), actor, 1000 + seed)
@@ -281,6 +298,14 @@ def run(method: str, name: str, seed: int, cache: Path, change: tuple[str, ...])
         choosing += seconds
     milliseconds = 1e3 * float(np.median(choosing))
     return [{"cpu_seconds": learning, "returns": returns, "steps": steps, "ms_per_step": milliseconds}]
+
+
+def summary(results: pd.DataFrame) -> pd.DataFrame:
+    """Takes median, worst and best over meta-trainings and unseen robots, and the median of each robot."""
+    returns = pd.DataFrame(list(results["returns"]), index=results["method"])
+    methods = [method for method in METHODS if method in returns.index]
+    over_all = returns.stack().groupby(level=0).agg(["median", "min", "max"])
+    return over_all.join(returns.groupby(level=0).median()).loc[methods]
 
 
 def main(args: Args) -> None:
@@ -293,12 +318,8 @@ def main(args: Args) -> None:
                 for seed in range(args.seeds)
             ]
             run_batches(batches, table, args.jobs, args.backend)
-        results = load(table)
-        returns = pd.DataFrame(list(results["returns"]), index=results["method"])
-        medians = returns.groupby(level=0).median()
-        medians["all"] = returns.T.median().groupby(level=0).median()
-        print(f"\n{name}: return of the first episode, medians over {args.seeds} meta-trainings")
-        print(medians.loc[[method for method in METHODS if method in medians.index]].round(1).to_string())
+        print(f"\n{name}: return of the first episode")
+        print(summary(load(table)).round(1).to_string())
 
 
 if __name__ == "__main__":

@@ -69,8 +69,8 @@ class ModelBasedAgent(BaseAlgorithm):
             environment's ``planning_reward_fn`` or ``reward_fn``, and where it has neither the reward is learnt with
             the dynamics.
         termination_fn: Whether an episode ends in s', for torch tensors (..., obs_dim) -> (...), so that the planner
-            knows. None takes the environment's ``termination_fn``, and where it has none the ends are learnt with the
-            dynamics, if there are any.
+            knows. None takes the environment's ``termination_fn``, and where it has none the ends are learnt beside
+            a policy (``policy_steps``), if there are any.
         angle_dims: Observation dimensions that are angles in rad. None takes the environment's ``angle_dims`` unless
             the settings say ``raw_angles``.
         quaternion_dims: The four observation dimensions of a unit quaternion, or none of them. None takes the
@@ -390,6 +390,7 @@ class ModelBasedAgent(BaseAlgorithm):
             "env": self._env_spec,
             "dimensions": {name: list(dims) for name, dims in self.dims.items()},
             "needs_reward_fn": self.policy.user_reward_fn is not None,
+            "needs_termination_fn": self.policy.user_termination_fn is not None,
             "seed": self.seed,
             "situations": list(source.situations),
             "transitions": source.digest() if isinstance(source, Transitions) else None,
@@ -630,6 +631,7 @@ class ModelBasedAgent(BaseAlgorithm):
             situations=self.situations,
             env=self._env_spec,
             needs_reward_fn=self.policy.user_reward_fn is not None,
+            needs_termination_fn=self.policy.user_termination_fn is not None,
             seed=self.seed,
             num_timesteps=self.num_timesteps,
             episodes=self._episode_num,
@@ -649,6 +651,7 @@ class ModelBasedAgent(BaseAlgorithm):
         env: GymEnv | str | None = None,
         device: torch.device | str = "auto",
         reward_fn: RewardFn | None = None,
+        termination_fn: TerminationFn | None = None,
         **overrides: Any,
     ) -> Self:
         """Reads an agent that :meth:`save` wrote; it acts as the saved one would have. Runs no code from the file.
@@ -658,24 +661,26 @@ class ModelBasedAgent(BaseAlgorithm):
             env: The environment; None makes the one that the file names, if it is one of ``famle_envs``.
             device: As in the constructor.
             reward_fn: As in the constructor; needed where the agent was made with one.
+            termination_fn: As in the constructor; needed where the agent was made with one.
             **overrides: Settings to change, and ``verbose`` or ``tensorboard_log``.
 
         Raises:
             FileNotFoundError: There is no such file.
             ValueError: The file is damaged, foreign or another kind of agent; the environment does not fit; a
-                ``reward_fn`` is needed.
+                ``reward_fn`` or a ``termination_fn`` is needed.
         """
         if "mode" in overrides:
             raise ValueError(
                 "A stored agent has all its settings, and no other mode; give load() the settings to change."
             )
         stored = Checkpoint.read(path)
-        stored.check_agent(cls.__name__, reward_fn is not None)
+        stored.check_agent(cls.__name__, reward_fn is not None, termination_fn is not None)
         if (made := stored.make_env() if env is None else make_env(env)) is not None:
             stored.check_spaces(made)
         # All settings are in the file, so that its mode need not be known for this environment.
         settings = {"config": stored.config, **stored.dims, **overrides}
-        agent = cls(made, reward_fn=reward_fn, device=device, pretrained=False, **settings)
+        task: dict[str, Any] = {"reward_fn": reward_fn, "termination_fn": termination_fn}
+        agent = cls(made, **task, device=device, pretrained=False, **settings)
         agent.mode, agent.num_timesteps, agent._episode_num = stored.mode, stored.num_timesteps, stored.episodes
         if made is None:
             agent.observation_space, agent.action_space, agent.n_envs = stored.observation_space, stored.action_space, 1

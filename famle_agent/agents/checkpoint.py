@@ -99,6 +99,7 @@ class Checkpoint:
         situations: The names of the training situations.
         env: Id and arguments of its environment; None where that cannot be named.
         needs_reward_fn: Whether it was made with a ``reward_fn``, which no file can hold.
+        needs_termination_fn: The same of a ``termination_fn``.
         seed: Its seed.
         num_timesteps: Steps that it has lived on robots.
         episodes: Episodes that it has lived on robots.
@@ -115,6 +116,7 @@ class Checkpoint:
     situations: tuple[str, ...]
     env: dict[str, Any] | None
     needs_reward_fn: bool
+    needs_termination_fn: bool
     seed: int | None
     num_timesteps: int
     episodes: int
@@ -133,6 +135,7 @@ class Checkpoint:
             "situations": list(self.situations),
             "env": self.env,
             "needs_reward_fn": self.needs_reward_fn,
+            "needs_termination_fn": self.needs_termination_fn,
             "seed": self.seed,
             "num_timesteps": self.num_timesteps,
             "episodes": self.episodes,
@@ -162,6 +165,7 @@ class Checkpoint:
                 situations=tuple(str(name) for name in list(meta["situations"])),
                 env=meta["env"],
                 needs_reward_fn=meta["needs_reward_fn"],
+                needs_termination_fn=meta.get("needs_termination_fn", False),  # which version 0.1 did not know
                 seed=meta["seed"],
                 num_timesteps=int(meta.get("num_timesteps", 0)),
                 episodes=int(meta.get("episodes", 0)),
@@ -184,20 +188,24 @@ class Checkpoint:
         weights = {name: value for name, value in self.tensors.items() if not name.startswith(("live/", "generator/"))}
         return replace(self, live=None, tensors=weights)
 
-    def check_agent(self, kind: str, has_reward_fn: bool) -> None:
+    def check_agent(self, kind: str, has_reward_fn: bool, has_termination_fn: bool) -> None:
         """Refuses an agent that cannot be what the file describes.
 
         Raises:
-            ValueError: It is of another kind, or has no ``reward_fn`` where the stored one was made with one.
+            ValueError: It is of another kind, or lacks a ``reward_fn`` or ``termination_fn`` that the stored one had.
         """
         if self.kind != kind:
             raise ValueError(
                 f"The file is no FAMLE checkpoint of {kind} but of {self.kind}; load it with {self.kind}.load()."
             )
-        if self.needs_reward_fn and not has_reward_fn:
-            raise ValueError(
-                "The agent was made with a reward_fn, which no file can hold: give load(..., reward_fn=...)."
-            )
+        for name, had, has in (
+            ("reward_fn", self.needs_reward_fn, has_reward_fn),
+            ("termination_fn", self.needs_termination_fn, has_termination_fn),
+        ):
+            if had and not has:
+                raise ValueError(
+                    f"The agent was made with a {name}, which no file can hold: give load(..., {name}=...)."
+                )
 
     def check_spaces(self, env: Any) -> None:
         """Refuses an environment with other spaces than the agent's.

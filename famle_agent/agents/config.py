@@ -107,6 +107,11 @@ class Config:
                 raise ValueError(f"{name} must be at least {least}, got {value!r}.")
             if name in _CHOICES and value not in _CHOICES[name]:
                 raise ValueError(f"{name} must be one of {', '.join(map(str, _CHOICES[name]))}, got {value!r}.")
+        if self.simulation.rounds and self.simulation.policy:
+            raise ValueError(
+                "rounds go on from random actions, and know nothing of the policy that policy_steps asks for: give one "
+                "of them, and 0 for the other."
+            )
         if self.simulation.rounds and self.training.joint is None:
             raise ValueError(
                 "With rounds, the agent plans in simulation after each of them, with what joint training has learnt: "

@@ -130,7 +130,7 @@ def search_policy(
     """
     builder, simulation, seed = agent.policy.builder, agent.policy.config.simulation, agent.draw_seed()
     settings = simulation.policy or PolicySearch()
-    data, weights = folder.search()
+    reported, (data, weights) = 0, folder.search()
     if data is not None and weights is not None and weights.exists():
         actor_critic = builder.actor_critic(len(envs.situations), settings.hidden)
         actor_critic.load_state_dict(load_file(weights))
@@ -140,7 +140,8 @@ def search_policy(
         search = Search(settings, envs.sources, envs.situations, seed, simulation.episode_length)
         try:
             for metrics in search.run():
-                callback(search.reported)
+                callback(search.done - reported)
+                reported = search.done
                 agent.num_iterations += 1
                 yield metrics
             transitions, actor_critic = search.transitions(), search.actor_critic()
@@ -187,7 +188,8 @@ def planning_policy(policy: AdaptivePolicy) -> MakePolicy:
         def reward_fn(obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
             return learned(obs, scale.to_unit(action), next_obs)  # type: ignore[no-any-return]
 
-    return make_planning(model, policy.config.planner, reward_fn, reward_names(policy.config.planning_reward))
+    rewards = reward_names(policy.config.planning_reward)
+    return make_planning(model, policy.config.planner, reward_fn, rewards, policy.known_termination_fn)
 
 
 def begin_model(
@@ -197,7 +199,9 @@ def begin_model(
     generator: torch.Generator,
     actor_critic: ActorCritic | None = None,
 ) -> tuple[Dynamics, Batch]:
-    """Gives a policy the model that is learnt in a round, and learns reward and ends of episodes where none are known.
+    """Gives a policy the model that is learnt in a round, and learns the reward where none is known.
+
+    Ends of episodes that nobody names are learnt beside an actor-critic alone: the paper's planner knows of none.
 
     Args:
         policy: Its ``world`` is replaced.
@@ -214,7 +218,7 @@ def begin_model(
     if policy.known_reward_fn is None:
         reward = builder.reward()
         reward.fit(obs, action, next_obs, builder.tensor(transitions.reward), generator)
-    if policy.known_termination_fn is None and transitions.ended.any():
+    if actor_critic is not None and policy.known_termination_fn is None and transitions.ended.any():
         termination = builder.termination()
         ended = torch.as_tensor(transitions.ended, device=next_obs.device)
         termination.fit(next_obs, ended, generator)

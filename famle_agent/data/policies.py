@@ -14,7 +14,7 @@ from torch import Tensor
 
 from famle_agent.data.action_scaling import ActionScale, to_action_space
 from famle_agent.models.dynamics import Dynamics
-from famle_agent.models.reward import Objective, RewardFn
+from famle_agent.models.reward import Objective, RewardFn, TerminationFn
 from famle_agent.models.simulator import Simulator
 from famle_agent.planning import Planner, shift
 
@@ -77,12 +77,12 @@ class PlanningPolicy:
     def __init__(
         self,
         model: Simulator,
-        reward_fn: RewardFn,
+        objective: Objective,
         planner: Planner,
         action_space: gym.spaces.Box,
         generator: torch.Generator,
     ) -> None:
-        self._model, self._objective = model, Objective(reward_fn)
+        self._model, self._objective = model, objective
         self._planner, self._space, self._generator = planner, action_space, generator
         self._plan: Tensor | None = None
 
@@ -125,12 +125,14 @@ class make_planning:  # noqa: N801
         planner: Looks for the actions.
         reward_fn: r(s, a, s') for actions of the environment; None takes the environment's own.
         rewards: What the environment may call its own; the first that it has counts.
+        termination_fn: Where episodes end; None knows of no ends.
     """
 
     model: Dynamics
     planner: Planner
     reward_fn: RewardFn | None
     rewards: tuple[str, ...] = REWARDS
+    termination_fn: TerminationFn | None = None
 
     @torch.no_grad()
     def __call__(self, env: gym.Env[Any, Any], situation: int, rng: np.random.Generator) -> Policy:
@@ -138,9 +140,13 @@ class make_planning:  # noqa: N801
         scale = ActionScale.of(env.action_space, torch.device("cpu"))  # type: ignore[arg-type]
         own = (env.get_wrapper_attr(name) for name in self.rewards if env.has_wrapper_attr(name))
         in_env_units: RewardFn = self.reward_fn or next(own)
+
+        def reward_fn(obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
+            return in_env_units(obs, scale.from_unit(action), next_obs)
+
         return PlanningPolicy(
             Simulator(self.model, self.model.embeddings_of(torch.tensor([situation]))),
-            lambda obs, action, next_obs: in_env_units(obs, scale.from_unit(action), next_obs),
+            Objective(reward_fn, self.termination_fn),
             self.planner,
             env.action_space,  # type: ignore[arg-type]
             torch.Generator().manual_seed(int(rng.integers(2**63))),

@@ -36,6 +36,16 @@ class Objective:
     discount: float = 1.0
 
 
+def _two_hidden_layers(inputs: int, width: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(inputs, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 1))
+
+
+def _deviations(x: Tensor) -> Tensor:
+    """The deviation of each column; what never changed must not be blown up."""
+    std = x.std(dim=0)
+    return torch.where(std > 1e-6, std, 1.0)
+
+
 class LearnedReward(nn.Module):
     """r(s, a, s') as a network of its own, since a situation changes the dynamics and never the task.
 
@@ -54,9 +64,7 @@ class LearnedReward(nn.Module):
         super().__init__()
         self._layout = replace(layout, pose_dims=())
         inputs = 2 * self._layout.n_features + action_dim
-        self.layers = nn.Sequential(
-            nn.Linear(inputs, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 1)
-        )
+        self.layers = _two_hidden_layers(inputs, width)
         self.register_buffer("mean", torch.zeros(inputs))
         self.register_buffer("std", torch.ones(inputs))
         self.register_buffer("reward_mean", torch.zeros(()))
@@ -81,8 +89,7 @@ class LearnedReward(nn.Module):
         """Least squares by Adam on transitions with any leading axes."""
         x, y = self._inputs(obs, action, next_obs).flatten(0, -2), reward.flatten()
         self.mean.copy_(x.mean(dim=0))
-        std = x.std(dim=0)
-        self.std.copy_(torch.where(std > 1e-6, std, 1.0))  # what never changed must not be blown up
+        self.std.copy_(_deviations(x))
         self.reward_mean.copy_(y.mean())
         self.reward_std.copy_(y.std().clamp(min=1e-6))
         x, y = (x - self.mean) / self.std, (y - self.reward_mean) / self.reward_std
@@ -115,9 +122,7 @@ class LearnedTermination(nn.Module):
         super().__init__()
         self._layout = replace(layout, pose_dims=())
         inputs = self._layout.n_features
-        self.layers = nn.Sequential(
-            nn.Linear(inputs, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 1)
-        )
+        self.layers = _two_hidden_layers(inputs, width)
         self.register_buffer("mean", torch.zeros(inputs))
         self.register_buffer("std", torch.ones(inputs))
 
@@ -133,8 +138,7 @@ class LearnedTermination(nn.Module):
         """Learns from observations with any leading axes; a quarter of each batch are ends, of which there are few."""
         x, y = self._layout.features(next_obs).flatten(0, -2), ended.flatten().float()
         self.mean.copy_(x.mean(dim=0))
-        std = x.std(dim=0)
-        self.std.copy_(torch.where(std > 1e-6, std, 1.0))
+        self.std.copy_(_deviations(x))
         x, ends = (x - self.mean) / self.std, torch.where(y > 0.0)[0]
         optimizer = torch.optim.Adam(self.parameters(), lr=1e-3)
         for _ in range(steps):

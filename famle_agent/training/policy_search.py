@@ -77,7 +77,6 @@ class Search:
 
     Attributes:
         sac: Stable-Baselines3's soft actor-critic.
-        reported: Simulated steps since the last report.
         chance: The state of NumPy's global generator, from which Stable-Baselines3 draws.
     """
 
@@ -99,7 +98,7 @@ class Search:
             limited = gym.wrappers.TimeLimit(env, episode_length) if episode_length else env
             return Monitor(_Told(limited, i, n))
 
-        self._steps, self.reported = settings.steps_of_each(n), 0
+        self._steps = settings.steps_of_each(n)
         self._action_space: spaces.Box = made[0].action_space  # type: ignore[assignment]
         self._obs_dim = made[0].observation_space.shape[0]  # type: ignore[index]
         envs = DummyVecEnv([lambda i=i: told(i) for i in range(n)])  # type: ignore[misc]
@@ -136,9 +135,13 @@ class Search:
             left = self._steps - self.sac.num_timesteps // n
             with _numpy_chance(self):
                 self.sac.learn(min(_CHUNK, left) * n, log_interval=None, reset_num_timesteps=False)  # type: ignore[arg-type]
-            self.reported = min(_CHUNK, left) * n
             returns = [info["r"] for info in self.sac.ep_info_buffer or ()]
             yield {"policy/return": float(np.mean(returns))} if returns else {}
+
+    @property
+    def done(self) -> int:
+        """Simulated steps of all situations so far."""
+        return self.sac.num_timesteps
 
     def transitions(self) -> Transitions:
         """Returns all that was gone through."""
@@ -150,8 +153,7 @@ class Search:
 
         told = buffer.observations, buffer.next_observations
         obs, next_obs = (of_each(values[..., : self._obs_dim]) for values in told)
-        low, high = self._action_space.low, self._action_space.high
-        action = low + 0.5 * (of_each(buffer.actions) + 1.0) * (high - low)
+        action: Any = self.sac.policy.unscale_action(of_each(buffer.actions))
         ended = of_each(buffer.dones * (1 - buffer.timeouts)) > 0
         return Transitions(obs, action, of_each(buffer.rewards), next_obs, self._situations, ended)
 

@@ -258,6 +258,12 @@ def test_rounds_without_joint_training_are_refused() -> None:
         settings(rounds=2)
 
 
+def test_rounds_beside_a_policy_are_refused() -> None:
+    """They would plan without it, and without what it knows of ends."""
+    with pytest.raises(ValueError, match="give one of them, and 0 for the other"):
+        settings(rounds=2, joint_iterations=3, policy_steps=100)
+
+
 def test_setting_that_an_agent_implies_is_refused() -> None:
     with pytest.raises(ValueError, match="gate_actions is False in every AMPC; leave it out"):
         AMPC("Pendulum-v1", device="cpu", gate_actions=True)

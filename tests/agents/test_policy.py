@@ -68,6 +68,29 @@ def test_ends_and_rewards_that_are_known_are_not_learnt() -> None:
     assert agent.controller.objective.termination_fn is agent.policy.user_termination_fn
 
 
+def test_ends_are_learnt_beside_a_policy_alone() -> None:
+    """The paper's planner knows of none, though its robots may fall."""
+    random_actions = {"policy_steps": 0, "transitions_per_situation": 60, "action_hold": 9}
+    kept = {name: value for name, value in TINY.items() if not name.startswith("policy_")}
+    agent = FAMLE(Reach(1.0), seed=0, **kept, **random_actions)
+    data = agent.collect(SITUATIONS)
+    assert data.ended.any()
+    agent.meta_learn(data)
+    assert set(agent.policy.world.parts()) == {"dynamics", "reward"}  # type: ignore[union-attr]
+    assert agent.controller.objective.termination_fn is None
+
+
+def test_ends_that_the_user_names_are_not_lost_with_a_file() -> None:
+    file = io.BytesIO()
+    learnt(termination_fn=lambda s: s[..., 0].abs() > 2.0).save(file)
+    file.seek(0)
+    with pytest.raises(ValueError, match=r"made with a termination_fn.*load\(\.\.\., termination_fn="):
+        FAMLE.load(file, env=Reach(1.0), device="cpu")
+    file.seek(0)
+    loaded = FAMLE.load(file, env=Reach(1.0), device="cpu", termination_fn=lambda s: s[..., 0].abs() > 2.0)
+    assert loaded.controller.objective.termination_fn is loaded.policy.user_termination_fn
+
+
 def test_stored_agent_has_all_of_it() -> None:
     agent, file = learnt(), io.BytesIO()
     agent.save(file)

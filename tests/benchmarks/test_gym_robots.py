@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from benchmarks import gym_robots
-from benchmarks.gym_robots import BEDS, METHODS, Args, Bed, Hanging, faulty, main
+from benchmarks.gym_robots import BEDS, METHODS, Args, Bed, Hanging, faulty, main, summary
 from benchmarks.results import load
 
 STEPS = 5
+ROOT = Path(__file__).parents[2]
 
 
 def small_bed() -> Bed:
@@ -37,6 +38,23 @@ def test_every_method_lives_one_episode_on_each_unseen_robot(
     shown = capsys.readouterr().out
     assert all(method in shown for method in METHODS)
     main(args)  # which has nothing left to do
+
+
+def test_readme_quotes_the_stored_results() -> None:
+    table = (ROOT / "README.md").read_text().partition("### Robots that nobody tuned")[2].partition("\n##")[0]
+    for bed in ("halfcheetah", "invertedpendulum", "pendulum"):
+        found = summary(load(ROOT / "benchmarks" / "results" / f"gym-{bed}.csv"))
+        for method in ("famle", "famle-frozen", "famle-unguided", "famle-actor"):
+            median, low, high = (f"{value:,.0f}" for value in found.loc[method, ["median", "min", "max"]])
+            assert f"{median} ({low} to {high})" in table, (bed, method)
+
+
+def test_time_of_learning_is_not_said_of_what_is_in_the_cache(tmp_path: Path) -> None:
+    (tmp_path / "gym-small-FAMLE-0.zip").touch()
+    assert gym_robots.is_learnt("famle-frozen", "small", 0, tmp_path, ())
+    assert not gym_robots.is_learnt("famle", "small", 1, tmp_path, ())
+    assert not gym_robots.is_learnt("famle", "small", 0, tmp_path, ("policy_steps=9",))
+    assert not gym_robots.is_learnt("sac", "small", 0, tmp_path, ())
 
 
 @pytest.mark.parametrize("name", BEDS)
