@@ -57,6 +57,10 @@ class PolicySearch:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(int(width) for width in self.hidden))
+        if not self.hidden or min(self.hidden) < 1:
+            raise ValueError(f"policy_hidden must name the width of at least one layer, got {self.hidden}.")
+        if self.untold > 1.0:
+            raise ValueError(f"policy_untold is a part of each batch, at most 1, got {self.untold!r}.")
         if not 0.0 < self.discount < 1.0:
             raise ValueError(f"discount must be above 0 and below 1, got {self.discount!r}.")
 

@@ -258,6 +258,14 @@ def test_rounds_without_joint_training_are_refused() -> None:
         settings(rounds=2)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("policy_hidden", ()), ("policy_hidden", (8, 0)), ("policy_untold", 1.5), ("discount", 1.0)]
+)
+def test_policy_out_of_range_is_refused(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=name):
+        Config.of({"policy_steps": 100, name: value})
+
+
 def test_rounds_beside_a_policy_are_refused() -> None:
     """They would plan without it, and without what it knows of ends."""
     with pytest.raises(ValueError, match="give one of them, and 0 for the other"):
