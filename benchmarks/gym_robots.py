@@ -21,15 +21,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pandas as pd
-import torch
 
 from benchmarks.methods import from_cache
+from benchmarks.model_free import MODEL_FREE, Policy, as_policy
 from benchmarks.results import Result, load
 from benchmarks.runner import Batch, Options, launch, run_batches
 from famle_agent import AMPC, AMPCMAML, FAMLE, FAMLEWrapper, ModelBasedAgent
-from famle_agent.data.action_scaling import to_action_space
-from famle_agent.models.actor_critic import ActorCritic
-from famle_agent.training.policy_search import PolicySearch, Search
+from famle_agent.training.policy_search import PolicySearch
 from famle_envs.faults import FaultWrapper
 
 Env = gym.Env[Any, Any]
@@ -144,8 +142,15 @@ BEDS: Mapping[str, Callable[[], Bed]] = {
 """Test beds by name."""
 
 
-METHODS = ("famle", "famle-frozen", "famle-unguided", "famle-actor", "sac", "ampc-reptile", "ampc", "nothing", "random")
-"""FAMLE, without adaptation, without its policy, its policy alone; SAC on all training robots; the rivals; neither."""
+METHODS = (
+    *("famle", "famle-frozen", "famle-unguided", "famle-actor"),
+    *("sac", "ppo", "sac-intact", "ppo-intact"),
+    *("ampc-reptile", "ampc", "nothing", "random"),
+)
+"""FAMLE, without adaptation, without its policy, its policy alone; what learns no model; the rivals; neither."""
+
+LONG = ("sac-10x", "ppo-10x")
+"""What takes an hour and more of each bed, and runs where it is asked for."""
 
 
 @dataclass(frozen=True)
@@ -200,17 +205,15 @@ class Planner(Actor):
         return self.agent.predict(obs)[0]
 
 
-class Policy(Actor):
+class Learnt(Actor):
     """A policy that is told nothing of the situation."""
 
-    def __init__(self, actor_critic: ActorCritic) -> None:
-        self.actor_critic = actor_critic
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
 
-    @torch.no_grad()
     def __call__(self, obs: Any) -> Any:
         """Does as it has learnt."""
-        numbers = torch.as_tensor(np.asarray(obs), dtype=torch.float32)
-        return to_action_space(self.actor_critic.act(numbers, torch.tensor(-1)), self.space)
+        return self.policy(obs)
 
 
 def kind_of(method: str) -> type[ModelBasedAgent]:
@@ -238,37 +241,26 @@ def agent_of(method: str, name: str, seed: int, cache: Path, change: tuple[str, 
     return agent
 
 
-def randomised_sac(name: str, seed: int) -> ActorCritic:
-    """Trains Stable-Baselines3's SAC as FAMLE does, on the same robots, but tells it never which one it is on."""
-    train = BEDS[name]().train
-    settings = FAMLE(train["intact"]()).config.simulation.policy or PolicySearch()
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        search = Search(replace(settings, untold=1.0), list(train.values()), list(train), seed)
-        for _ in search.run():
-            pass
-    search.close()
-    return search.actor_critic()
-
-
 def is_learnt(method: str, name: str, seed: int, cache: Path, change: tuple[str, ...]) -> bool:
     """Tells whether what a method meta-learns is in the cache, so that nothing can be said of the time it takes."""
-    return method not in ("sac", "nothing", "random") and cached_at(method, name, seed, cache, change).exists()
+    return method not in (*MODEL_FREE, "nothing", "random") and cached_at(method, name, seed, cache, change).exists()
 
 
 def actor_of(method: str, name: str, seed: int, cache: Path, change: tuple[str, ...]) -> Actor:
     """Makes what chooses the actions."""
     if method in ("nothing", "random"):
         return Nothing() if method == "nothing" else Actor()
-    if method == "sac":
-        return Policy(randomised_sac(name, seed))
+    if method in MODEL_FREE:
+        train = BEDS[name]().train
+        settings = FAMLE(train["intact"]()).config.simulation.policy or PolicySearch()
+        return Learnt(MODEL_FREE[method].learn(train, settings, seed))
     agent = agent_of(method, name, seed, cache, change)
     if method != "famle-actor":
         return Planner(agent)
     world = agent.policy.world
     if world is None or world.actor_critic is None:
         raise ValueError("This agent has learnt no policy; leave out famle-actor, or give it policy_steps.")
-    return Policy(world.actor_critic)
+    return Learnt(as_policy(world.actor_critic, agent.action_space))
 
 
 def episode(env: Env, actor: Actor, seed: int) -> tuple[float, list[float]]:
@@ -303,7 +295,7 @@ def run(method: str, name: str, seed: int, cache: Path, change: tuple[str, ...])
 def summary(results: pd.DataFrame) -> pd.DataFrame:
     """Takes median, worst and best over meta-trainings and unseen robots, and the median of each robot."""
     returns = pd.DataFrame(list(results["returns"]), index=results["method"])
-    methods = [method for method in METHODS if method in returns.index]
+    methods = [method for method in (*METHODS, *LONG) if method in returns.index]
     over_all = returns.stack().groupby(level=0).agg(["median", "min", "max"])
     return over_all.join(returns.groupby(level=0).median()).loc[methods]
 

@@ -81,6 +81,7 @@ class Search:
 
     Attributes:
         sac: Stable-Baselines3's soft actor-critic.
+        action_space: Of the robot.
         chance: The state of NumPy's global generator, from which Stable-Baselines3 draws.
     """
 
@@ -103,7 +104,7 @@ class Search:
             return Monitor(_Told(limited, i, n))
 
         self._steps = settings.steps_of_each(n)
-        self._action_space: spaces.Box = made[0].action_space  # type: ignore[assignment]
+        self.action_space: spaces.Box = made[0].action_space  # type: ignore[assignment]
         self._obs_dim = made[0].observation_space.shape[0]  # type: ignore[index]
         envs = DummyVecEnv([lambda i=i: told(i) for i in range(n)])  # type: ignore[misc]
         envs.seed(seed)
@@ -164,7 +165,7 @@ class Search:
     def actor_critic(self) -> ActorCritic:
         """Returns what was learnt."""
         sac, scale, n = self.sac, self._envs, len(self._situations)
-        made = ActorCritic(self._obs_dim, self._action_space.shape[0], n, self._settings.hidden)
+        made = ActorCritic(self._obs_dim, self.action_space.shape[0], n, self._settings.hidden)
         learnt = [*sac.actor.latent_pi.parameters(), *sac.actor.mu.parameters(), *sac.critic.parameters()]
         obs_rms: Any = scale.obs_rms
         with torch.no_grad():

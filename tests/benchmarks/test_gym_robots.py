@@ -2,13 +2,17 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from benchmarks import gym_robots
-from benchmarks.gym_robots import BEDS, METHODS, Args, Bed, Hanging, faulty, main, summary
+from benchmarks.gym_robots import BEDS, METHODS, Args, Bed, Env, Hanging, faulty, main, summary
+from benchmarks.model_free import MODEL_FREE
 from benchmarks.results import load
+from famle_agent.training.policy_search import PolicySearch
 
 STEPS = 5
 ROOT = Path(__file__).parents[2]
@@ -55,6 +59,34 @@ def test_time_of_learning_is_not_said_of_what_is_in_the_cache(tmp_path: Path) ->
     assert not gym_robots.is_learnt("famle", "small", 1, tmp_path, ())
     assert not gym_robots.is_learnt("famle", "small", 0, tmp_path, ("policy_steps=9",))
     assert not gym_robots.is_learnt("sac", "small", 0, tmp_path, ())
+
+
+@pytest.mark.parametrize(
+    ("name", "budget", "robots"),
+    [("sac", 1, 2), ("sac-10x", 10, 2), ("sac-intact", 1, 1), ("ppo", 1, 2), ("ppo-10x", 10, 2), ("ppo-intact", 1, 1)],
+)
+def test_agents_without_a_model_get_the_robots_and_steps_that_their_names_say(
+    name: str, budget: int, robots: int
+) -> None:
+    taken = dict.fromkeys(small_bed().train, 0)
+
+    def counted(situation: str) -> Env:
+        class Counted(gym.Wrapper[Any, Any, Any, Any]):
+            def step(self, action: Any) -> Any:
+                taken[situation] += 1
+                return super().step(action)
+
+        return Counted(small_bed().train[situation]())
+
+    train = {situation: partial(counted, situation) for situation in taken}
+    settings = PolicySearch(steps=30, random_steps=4, hidden=(8,), batch_size=4)
+    policy = MODEL_FREE[name].learn(train, settings, seed=0)
+    steps = list(taken.values())
+    assert all(n > 0 for n in steps[:robots])
+    assert not any(steps[robots:])
+    rollout = 2048 if name.startswith("ppo") else 50  # which it ends where it has begun one
+    assert budget * 30 <= sum(steps) <= budget * 30 + rollout
+    assert small_bed().test["motor 0 dead"]().action_space.contains(policy(np.zeros(3)))
 
 
 @pytest.mark.parametrize("name", BEDS)
