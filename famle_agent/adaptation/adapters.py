@@ -12,17 +12,20 @@ from torch import Tensor
 from famle_agent.adaptation.belief import (
     Belief,
     Candidates,
+    Evidence,
     choose,
     filtered_posterior,
     prior,
     systematic_sample,
     unadapted,
+    updated_excess,
     window_posterior,
 )
 from famle_agent.adaptation.memory import Memory, Sample, minibatches, whole_memory
 from famle_agent.adaptation.settings import Adaptation, Filter
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
+from famle_agent.models.likelihood import trust
 from famle_agent.models.simulator import Simulator
 
 __all__ = ["EmbeddingAdapter", "GradientAdapter", "descend", "select"]
@@ -57,28 +60,37 @@ class EmbeddingAdapter:
         """
         return prior(self.model, self.candidates, robots)
 
-    def log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
+    def judge(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> Evidence:
         """Judges a transition by theta_meta with each candidate, and by theta* and h* where steps go on from there."""
         transition = self.model.encode(obs[:, None], action[:, None], next_obs[:, None])  # (B, 1, ...)
+        residual = self.candidates.residuals(self.model, transition)[:, :, 0]  # (B, P, C, obs_dim)
+        excess = belief.excess.clamp(min=1.0)[:, None, None]  # the noise that was fitted is the least there is
+        log_p = self.model.log_density(residual, excess.sqrt())  # (B, C)
+        own = torch.zeros_like(log_p[:, 0])
+        if self.settings.warm_start:
+            adapted = self.model.residuals(transition, belief.h, belief.theta)  # (B, P, 1, obs_dim)
+            own = self.model.log_density(adapted, excess.sqrt())[:, 0]
+        squared = residual.square()
+        squared = squared * trust(squared / excess, self.model.degrees_of_freedom)
+        expected = (belief.posterior[:, None, :, None] * squared).sum(dim=2).mean(dim=1)  # (B, obs_dim)
         power = self.settings.likelihood_power
-        log_p = power * self.candidates.log_likelihood(self.model, transition)[:, 0]  # (B, C)
-        if not self.settings.warm_start:
-            return log_p, torch.zeros_like(log_p[:, 0])
-        return log_p, power * self.model.log_likelihood(transition, belief.h, belief.theta)[:, 0]
+        return Evidence(power * log_p, power * own, expected)
 
-    def infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
+    def infer(self, memory: Memory, belief: Belief, evidence: Evidence, moved: Tensor) -> Belief:
         """Filters over all transitions where a hazard is set, else takes the likelihood of the last (the paper)."""
-        if isinstance(evidence := self.settings.evidence, Filter):
-            new = filtered_posterior(self.candidates, belief.log_posterior, memory.log_p[:, -1], evidence.hazard)
-            return replace(belief, log_posterior=torch.where(moved[:, None], new, belief.log_posterior))
-        return replace(belief, log_posterior=window_posterior(self.candidates, memory))
+        if not isinstance(how := self.settings.evidence, Filter):
+            return replace(belief, log_posterior=window_posterior(self.candidates, memory))
+        posterior = filtered_posterior(self.candidates, belief.log_posterior, evidence.log_p, how.hazard)
+        excess = updated_excess(belief.excess, evidence.squared, memory.weight.sum(dim=1))
+        new = replace(belief, log_posterior=posterior, excess=excess)
+        return new.where(moved, belief)
 
     def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
         """Selects the most likely embedding (line 6), then takes k gradient steps on theta and h (line 7)."""
         start = self._selected(belief)
         if self.settings.warm_start:
             changed = memory.better_explained(start.candidate) & (start.candidate != belief.candidate)
-            memory = memory.begun_anew(changed, self.settings.window, start.candidate)
+            memory = memory.begun_anew(changed, start.candidate)
             start = start.where(changed, replace(belief, adaptations=start.adaptations))
         return memory, gradient_steps(self.model, start, memory, self.settings, self.seed)
 
@@ -124,12 +136,12 @@ class GradientAdapter:
         """Returns theta_meta. See :class:`~famle_agent.adaptation.controller.Adapter`, here and below."""
         return unadapted(self.model, torch.zeros(1, device=self.model.embeddings.device), robots)
 
-    def log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
+    def judge(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> Evidence:
         """Returns zeros: there is one model, and nothing to tell apart."""
         nothing = torch.zeros(len(obs), device=obs.device)
-        return nothing[:, None], nothing
+        return Evidence(nothing[:, None], nothing, torch.ones_like(obs))
 
-    def infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
+    def infer(self, memory: Memory, belief: Belief, evidence: Evidence, moved: Tensor) -> Belief:
         """Returns the belief as it is."""
         return belief
 
@@ -194,7 +206,8 @@ def select(model: Dynamics, candidates: Candidates, belief: Belief, spread: bool
         offset = belief.adaptations * _GOLDEN_RATIO % 1.0
         likely = systematic_sample(belief.posterior, model.members, offset)  # (B, P)
     theta_meta, h_likely = model.theta_of(len(likely)), candidates.chosen(likely)
-    return Belief(theta_meta, h_likely, belief.log_posterior, likeliest, belief.diverged, belief.adaptations + 1)
+    new = replace(belief, theta=theta_meta, h=h_likely, candidate=likeliest)
+    return replace(new, adaptations=belief.adaptations + 1)
 
 
 @torch.no_grad()

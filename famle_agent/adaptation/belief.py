@@ -16,13 +16,20 @@ from famle_agent.models.dynamics import Batch, Dynamics, Theta
 __all__ = [
     "Belief",
     "Candidates",
+    "Evidence",
     "choose",
     "filtered_posterior",
     "prior",
     "systematic_sample",
     "unadapted",
+    "updated_excess",
     "window_posterior",
 ]
+
+
+_KINDS = (0.4, 0.4, 0.2)  # how likely no fault is, one, and two
+_BELIEVED = 10.0  # transitions for which the noise that was fitted in simulation counts
+_REMEMBERED = 100.0  # and over which the errors of a robot are averaged
 
 
 @dataclass(frozen=True)
@@ -52,10 +59,16 @@ class Candidates:
 
     @cached_property
     def log_prior(self) -> Tensor:
-        """One fault is as likely as two, (C,); probabilities that sum to 1."""
-        single = self.pairs[:, 1] == 0
-        size = torch.where(single, single.sum(), (~single).sum())
-        return (-size.float().log()).log_softmax(dim=0)
+        """How likely each is before anything is seen, (C,); probabilities that sum to 1.
+
+        Without sums all are alike, as in the paper. With them the intact robot is as likely as all single faults
+        together, and twice as likely as all sums.
+        """
+        faults = (self.pairs > 0).sum(dim=1)  # of each candidate
+        if int(faults.max()) < 2:
+            return torch.zeros_like(faults, dtype=torch.float32).log_softmax(dim=0)
+        kind = torch.tensor(_KINDS, device=faults.device) / faults.bincount()
+        return kind[faults].log().log_softmax(dim=0)
 
     def marginal(self, posterior: Tensor) -> Tensor:
         """Computes how likely each training situation is, alone or as a part: (B, C) -> (B, N)."""
@@ -83,6 +96,17 @@ class Candidates:
         Returns:
             (B, n, C); 0 for padding.
         """
+        residual = self.residuals(model, data)
+        log_p = model.log_density(residual.flatten(2, 3)).view(len(residual), *residual.shape[2:4])
+        return log_p * data.weight[..., None]
+
+    def residuals(self, model: Dynamics, data: Batch) -> Tensor:
+        """Computes the errors of theta_meta with each candidate in fitted deviations, (B, P, n, C, obs_dim).
+
+        Args:
+            model: Holds theta_meta.
+            data: Encoded transitions of the B robots, (B, n).
+        """
         robots, n = data.weight.shape
         owners, C = model.robots, len(self.pairs)
         sharing = robots // owners  # B robots share the networks, or each has its own
@@ -94,8 +118,24 @@ class Candidates:
 
         h = self.h.repeat_interleave(sharing * n, dim=2)
         batch = Batch(rows(data.x), rows(data.y), rows(data.weight))
-        log_p = model.log_likelihood(batch, h, model.theta_of(owners))
-        return log_p.view(owners, C, sharing, n).permute(0, 2, 3, 1).flatten(0, 1)
+        residual = model.residuals(batch, h, model.theta_of(owners))  # (R, P, C * sharing * n, obs_dim)
+        parts = residual.view(*residual.shape[:2], C, sharing, n, -1)
+        return parts.permute(0, 3, 1, 4, 2, 5).flatten(0, 1)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What one transition of each of B robots says.
+
+    Attributes:
+        log_p: Its log-likelihood under each candidate, (B, C).
+        own_log_p: And under the adapted model, (B,).
+        squared: Squared errors in fitted deviations, by how likely each candidate was before, (B, obs_dim).
+    """
+
+    log_p: Tensor
+    own_log_p: Tensor
+    squared: Tensor
 
 
 @dataclass(frozen=True)
@@ -106,6 +146,7 @@ class Belief:
         theta: theta*, in each of the P members of the ensemble, (B, P, ...).
         h: h*, (B, P, embedding_dim).
         log_posterior: Log P(candidate | memory) but for a constant, (B, C).
+        excess: Mean square of the robot's errors in each observed number, in fitted deviations, (B, obs_dim).
         candidate: The candidate with which theta* and h* began, (B,).
         diverged: How many adaptations of each robot left the finite numbers and were taken back, (B,).
         adaptations: How often the robots have adapted.
@@ -114,6 +155,7 @@ class Belief:
     theta: Theta
     h: Tensor
     log_posterior: Tensor
+    excess: Tensor
     candidate: Tensor
     diverged: Tensor
     adaptations: int = 0
@@ -134,6 +176,7 @@ class Belief:
             {name: choose(kept, value, other.theta[name]) for name, value in self.theta.items()},
             choose(kept, self.h, other.h),
             choose(kept, self.log_posterior, other.log_posterior),
+            choose(kept, self.excess, other.excess),
             choose(kept, self.candidate, other.candidate),
             choose(kept, self.diverged, other.diverged),
             self.adaptations,
@@ -149,7 +192,8 @@ def unadapted(model: Dynamics, log_prior: Tensor, robots: int) -> Belief:
     """Returns theta_meta and the first embedding for B robots, with the log prior (C,) of what there is to select."""
     none = torch.zeros(robots, dtype=torch.long, device=model.embeddings.device)
     log_prior = log_prior.expand(robots, -1)
-    return Belief(model.theta_of(robots), model.embeddings_of(none), log_prior, candidate=none, diverged=none)
+    theta, h, excess = model.theta_of(robots), model.embeddings_of(none), log_prior.new_ones(robots, model.obs_dim)
+    return Belief(theta, h, log_prior, excess, candidate=none, diverged=none)
 
 
 def window_posterior(candidates: Candidates, memory: Memory) -> Tensor:
@@ -172,6 +216,17 @@ def filtered_posterior(candidates: Candidates, log_posterior: Tensor, log_p: Ten
     """
     stays = log_posterior.log_softmax(dim=1) + math.log1p(-hazard)
     return (torch.logaddexp(stays, candidates.log_prior + math.log(hazard)) + log_p).log_softmax(dim=1)
+
+
+def updated_excess(excess: Tensor, squared: Tensor, seen: Tensor) -> Tensor:
+    """Averages squared errors over what a robot has seen, the newest hundred above all, (B, obs_dim).
+
+    Args:
+        excess: Their mean before, (B, obs_dim).
+        squared: Of the newest transition, (B, obs_dim).
+        seen: How many transitions there were, (B,).
+    """
+    return torch.lerp(excess, squared, (1.0 / (_BELIEVED + seen.clamp(max=_REMEMBERED)))[:, None])
 
 
 def systematic_sample(posterior: Tensor, n: int, offset: float) -> Tensor:

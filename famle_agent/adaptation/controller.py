@@ -12,7 +12,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation.belief import Belief
+from famle_agent.adaptation.belief import Belief, Evidence
 from famle_agent.adaptation.guide import Guide
 from famle_agent.adaptation.memory import Memory
 from famle_agent.models.reward import Objective
@@ -62,7 +62,7 @@ class OnlineState:
         """All but :attr:`last` and the counts, for a checkpoint; files have robots and members in one axis."""
         tensors = {f"theta.{name}": value.flatten(0, 1) for name, value in self.belief.theta.items()}
         tensors |= {f"memory.{name}": value for name, value in vars(self.memory).items()}
-        belief = {name: getattr(self.belief, name) for name in ("log_posterior", "candidate", "diverged")}
+        belief = {name: getattr(self.belief, name) for name in ("log_posterior", "excess", "candidate", "diverged")}
         return tensors | belief | {"h": self.belief.h.flatten(0, 1), "plan": self.plan}
 
     @classmethod
@@ -74,10 +74,11 @@ class OnlineState:
 
         log_posterior, candidate = tensors["log_posterior"], tensors["candidate"]
         diverged = tensors.get("diverged", torch.zeros_like(candidate))  # files of version 0.1 do not count
+        excess = tensors.get("excess", torch.ones_like(tensors["memory.obs"][:, 0]))  # nor know of other noise
         robots = len(candidate)
         theta = {name: value.view(robots, -1, *value.shape[1:]) for name, value in part("theta.").items()}
         h = tensors["h"].view(robots, -1, tensors["h"].shape[1])
-        belief = Belief(theta, h, log_posterior, candidate, diverged, adaptations)
+        belief = Belief(theta, h, log_posterior, excess, candidate, diverged, adaptations)
         return cls(Memory(**part("memory.")), belief, tensors["plan"], steps=steps, adapted_at=adapted_at)
 
 
@@ -87,10 +88,10 @@ class Adapter(Protocol):
     def initial(self, robots: int) -> Belief:
         """Returns what B robots believe before they have seen anything: theta_meta and a first embedding."""
 
-    def log_likelihood(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
-        """Computes log p of a transition of each robot under each candidate, (B, C), and under its belief, (B,)."""
+    def judge(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> Evidence:
+        """Says what a transition of each robot speaks for."""
 
-    def infer(self, memory: Memory, belief: Belief, moved: Tensor) -> Belief:
+    def infer(self, memory: Memory, belief: Belief, evidence: Evidence, moved: Tensor) -> Belief:
         """Updates the posterior by the newest transition of the robots that ``moved`` (B,)."""
 
     def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
@@ -147,13 +148,13 @@ class Controller:
         """
         if state.last is None:
             return state
-        log_p = self.adapter.log_likelihood(state.belief, *state.last, obs)
-        memory, belief = state.memory.add(*state.last, obs, *log_p, valid=~starts), state.belief
+        evidence, belief = self.adapter.judge(state.belief, *state.last, obs), state.belief
+        memory = state.memory.add(*state.last, obs, evidence.log_p, evidence.own_log_p, valid=~starts)
         if starts.all():
             return replace(state, last=None)
         steps = state.steps + 1
         if self.adapt_every or self.adapt_at_reset:
-            belief = self.adapter.infer(memory, belief, ~starts)
+            belief = self.adapter.infer(memory, belief, evidence, ~starts)
         if self.adapt_every and steps % self.adapt_every == 0:
             memory, belief = self.adapter.adapt(memory, belief)
         return replace(state, memory=memory, belief=belief, last=None, steps=steps)

@@ -101,17 +101,21 @@ class Memory:
 
         return Memory(**{name: choose(values, getattr(other, name)) for name, values in vars(self).items()})
 
-    def begun_anew(self, rows: Tensor, newest: int, candidate: Tensor) -> Memory:
+    def begun_anew(self, rows: Tensor, candidate: Tensor) -> Memory:
         """The memory of robots that take their newest transitions for those of another situation.
+
+        They keep those since which that situation explains most more than they believed.
 
         Args:
             rows: Which robots do, (B,).
-            newest: How many transitions they keep.
             candidate: What they believe from now on, and as if they had believed it in these transitions, (B,).
         """
-        _, kept = self.split(newest)
-        weight = torch.where(rows[:, None], kept.weight, self.weight)
-        own_log_p = torch.where(rows[:, None], self.explained_by(candidate), self.own_log_p)
+        explained = self.explained_by(candidate)
+        gain = ((explained - self.own_log_p) * self.judging).flip(1).cumsum(dim=1).flip(1)  # from each on, (B, W)
+        age = torch.arange(self.weight.shape[1], 0, -1, device=gain.device)
+        kept = age <= gain.shape[1] - gain.argmax(dim=1, keepdim=True)  # (B, M)
+        weight = torch.where(rows[:, None], self.weight * kept, self.weight)
+        own_log_p = torch.where(rows[:, None], explained, self.own_log_p)
         return replace(self, own_log_p=own_log_p, weight=weight)
 
     def better_explained(self, candidate: Tensor) -> Tensor:

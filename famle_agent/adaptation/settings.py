@@ -10,6 +10,9 @@ from famle_agent.models.gradient_steps import InnerLoop
 __all__ = ["Adaptation", "Epochs", "Filter", "GradientSteps", "Steps", "Window"]
 
 
+_FILTER_WINDOW = 100
+
+
 @dataclass(frozen=True)
 class Window:
     """The posterior is the likelihood of the newest transitions, as in the paper.
@@ -143,8 +146,9 @@ class Adaptation:
 
     @property
     def window(self) -> int:
-        """W, how many of the newest transitions the posterior counts where it is a window's."""
-        return (self.evidence.size if isinstance(self.evidence, Window) else 0) or self.memory_size
+        """W, how many of the newest transitions judge the candidates against the adapted model."""
+        size = self.evidence.size if isinstance(self.evidence, Window) else _FILTER_WINDOW
+        return min(size or self.memory_size, self.memory_size)
 
     @property
     def warm_start(self) -> bool:

@@ -266,10 +266,24 @@ class Dynamics(nn.Module):
 
         It is 0 for padding, and of normalised targets. Arguments as for :meth:`loss`.
         """
-        y, weight = _with_members(batch.y), _with_members(batch.weight, axes=3)
+        weight = _with_members(batch.weight, axes=3)
+        return self.log_density(self.residuals(batch, h, theta), weight=weight)
+
+    def residuals(self, batch: Batch, h: Tensor, theta: Theta | None = None) -> Tensor:
+        """Computes the errors of the normalised targets, in fitted deviations, (B, P, n, obs_dim)."""
         noise = self._of(self.noise_std, len(h))[:, :, None]  # (B, P, 1, obs_dim)
-        residual = (self.forward(batch.x, h, theta) - y) / noise
-        log_p = (log_density(residual, self.degrees_of_freedom) - noise.log()).sum(dim=-1) * weight
+        return (self.forward(batch.x, h, theta) - _with_members(batch.y)) / noise
+
+    def log_density(self, residual: Tensor, excess: Tensor | float = 1.0, weight: Tensor | float = 1.0) -> Tensor:
+        """Computes log p of transitions with given residuals, a mean over the members, (B, n).
+
+        Args:
+            residual: As of :meth:`residuals`, (B, P, n, obs_dim).
+            excess: By how much the noise is above the fitted one, broadcast to the residuals.
+            weight: 1 for a transition and 0 for padding, broadcast to (B, P, n).
+        """
+        noise = self._of(self.noise_std, len(residual))[:, :, None] * excess
+        log_p = (log_density(residual / excess, self.degrees_of_freedom) - noise.log()).sum(dim=-1) * weight
         # An observation beyond all measure would make every likelihood -inf and a posterior meaningless.
         return log_p.mean(dim=1).clamp(min=-1e30)
 

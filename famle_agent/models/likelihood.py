@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
+import torch
 from torch import Tensor
 
-__all__ = ["fitted_scale", "log_density"]
+__all__ = ["fitted_scale", "log_density", "trust"]
 
 _MIN_SCALE = 1e-3  # of a normalised target; keeps the likelihood finite where the model is exact
 _EM_STEPS = 20
@@ -26,6 +27,15 @@ def log_density(residual: Tensor, degrees_of_freedom: float) -> Tensor:
     return constant - (nu + 1) / 2 * (residual.square() / nu).log1p()
 
 
+def trust(squared: Tensor, degrees_of_freedom: float) -> Tensor:
+    """Computes how much a squared residual of scale 1 tells about the scale, elementwise; 1 for a Gaussian.
+
+    A Student-t is a Gaussian whose variance is drawn anew for each value: this is what to expect of its inverse.
+    """
+    nu = degrees_of_freedom
+    return (nu + 1) / (nu + squared) if nu else torch.ones_like(squared)
+
+
 def fitted_scale(squared: Tensor, weight: Tensor, degrees_of_freedom: float) -> Tensor:
     """Finds the scale of maximum likelihood.
 
@@ -41,7 +51,6 @@ def fitted_scale(squared: Tensor, weight: Tensor, degrees_of_freedom: float) -> 
     weight = weight.view(1, -1, 1)
     variance = ((squared * weight).sum(dim=1, keepdim=True) / weight.sum()).clamp(min=least)
     for _ in range(_EM_STEPS if nu else 0):
-        # Expectation maximisation: a Student-t is a Gaussian whose variance is drawn anew for each value.
-        trust = weight * (nu + 1) / (nu + squared / variance)
-        variance = ((squared * trust).sum(dim=1, keepdim=True) / weight.sum()).clamp(min=least)
+        weighed = weight * trust(squared / variance, nu) * squared  # expectation maximisation
+        variance = (weighed.sum(dim=1, keepdim=True) / weight.sum()).clamp(min=least)
     return variance[:, 0].sqrt()
