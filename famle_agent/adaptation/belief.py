@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -164,6 +164,17 @@ class Belief:
     def posterior(self) -> Tensor:
         """P(candidate | memory), (B, C)."""
         return torch.softmax(self.log_posterior, dim=1)
+
+    @property
+    def error(self) -> float:
+        """Root mean square of the first robot's errors, in deviations that were fitted in simulation."""
+        return float(self.excess[0].mean().sqrt())
+
+    def of(self, robot: int) -> Belief:
+        """The belief about one robot alone, as of B = 1."""
+        theta = {name: value[robot : robot + 1] for name, value in self.theta.items()}
+        names = ("h", "log_posterior", "excess", "candidate", "diverged")
+        return replace(self, theta=theta, **{name: getattr(self, name)[robot : robot + 1] for name in names})
 
     def is_finite(self) -> Tensor:
         """Says for which robots all parameters are finite numbers, (B,)."""

@@ -26,6 +26,7 @@ from typing_extensions import Self
 from famle_agent.adaptation.adapters import EmbeddingAdapter, GradientAdapter
 from famle_agent.adaptation.belief import Belief
 from famle_agent.adaptation.controller import Adapter, Controller, OnlineState
+from famle_agent.adaptation.diagnosis import Diagnosis
 from famle_agent.agents.check import Check, check_plans
 from famle_agent.agents.checkpoint import Checkpoint, File, joined
 from famle_agent.agents.config import Config
@@ -580,6 +581,24 @@ class ModelBasedAgent(BaseAlgorithm):
     def marginals(self, state: OnlineState | None = None) -> dict[str, float]:
         """As :meth:`posterior`, but of each training situation, be it alone or a part of what is wrong."""
         return self.adapter.marginals(self.belief if state is None else state.belief, self.situations)
+
+    def diagnose(self, state: OnlineState | None = None, robot: int = 0) -> Diagnosis:
+        """Says in words what is most likely wrong with a robot, and how sure that is: ``print(agent.diagnose())``.
+
+        Args:
+            state: As :meth:`predict` returns it; None asks what the agent believes now.
+            robot: Which of the robots that run side by side.
+
+        Raises:
+            IndexError: There is no such robot.
+            NotLearnedError: The agent has no model yet.
+        """
+        state = state or self._live or self.state_of(self.model.robots)
+        if not 0 <= robot < state.robots:
+            raise IndexError(f"There are robots 0 to {state.robots - 1}, not {robot}.")
+        belief = state.belief.of(robot)
+        posterior = self.adapter.posterior(belief, self.situations)
+        return Diagnosis.of(posterior, belief.error, int(state.memory.weight[robot].sum()))
 
     def _observed(self, state: OnlineState) -> OnlineState:
         """Passes a state on, and warns of the first adaptation that diverged."""

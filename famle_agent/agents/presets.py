@@ -73,8 +73,9 @@ def known_robots() -> dict[str, Robot]:
     any_robot = entries["default"]
     robots = {}
     for name, entry in entries.items():
-        # A file says only what differs: of the paper's settings for any robot, and of the paper's for this one.
-        modes = {"ours": entry["ours"], "paper": any_robot["paper"] | entry["paper"]}
+        # A file says only what differs: of how any robot adapts, of the paper's settings, of the paper's for this one.
+        ours, paper = (any_robot[of_any] | entry[mode] for of_any, mode in (("adaptation", "ours"), ("paper", "paper")))
+        modes = {"ours": ours, "paper": paper}
         if "original" in entry:
             modes["original"] = modes["paper"] | entry["original"]
         robots[name] = Robot(name, entry["env_id"], modes, entry["rivals"])

@@ -1,0 +1,54 @@
+"""What is most likely wrong with a robot, and how far that can be believed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+__all__ = ["Diagnosis"]
+
+_STRANGE = 2.5  # times the errors of simulation; robots in another simulator's profile stay below
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Names what is most likely wrong with one robot.
+
+    Attributes:
+        situation: The most likely training situation, or ``"a + b"`` for two faults at once.
+        probability: How likely it is among all that were trained.
+        error: Errors of its predictions, in those of simulation: about 1 where the robot is as it was trained.
+        steps: Transitions that this rests on.
+    """
+
+    situation: str
+    probability: float
+    error: float
+    steps: int
+
+    @classmethod
+    def of(cls, posterior: Mapping[str, float], error: float, steps: int) -> Diagnosis:
+        """Makes the diagnosis that a posterior stands for.
+
+        Args:
+            posterior: P(situation | memory) by name.
+            error: Errors of the predictions, in those of simulation.
+            steps: Transitions that were seen.
+        """
+        situation = max(posterior, key=lambda name: posterior[name])
+        return cls(situation, posterior[situation], error, steps)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the robot does what some training situation, or the sum of two, predicts."""
+        return self.error < _STRANGE
+
+    def __str__(self) -> str:
+        if not self.steps:
+            return "Nothing has been seen of the robot yet."
+        if not self.is_known:
+            return (
+                f"Unlike anything that was trained: errors are {self.error:.1f} times those of simulation. "
+                f"The nearest is {self.situation} ({self.probability:.0%})."
+            )
+        return f"Most likely {self.situation} ({self.probability:.0%})."
