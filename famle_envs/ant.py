@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import product
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-import pybullet
 from gymnasium import spaces
 
 from famle_envs.arguments import number_within
-from famle_envs.bullet_env import Array, BulletEnv
+from famle_envs.engines.world import Array, Body, Camera
+from famle_envs.robot_env import RobotEnv
 from famle_envs.situation import Situation
 
 __all__ = ["AntEnv"]
@@ -22,6 +23,7 @@ FLOOR_FRICTION = 0.8
 FALLEN_HEIGHT = 0.26  # of the torso's centre; its radius is 0.25 (m)
 CONTROL_RATE = 60.6  # of the authors' code (Hz); the paper says 100
 _SUBSTEPS = 4  # physics steps a control step
+_LEGS = ("front_left", "back_left", "back_right", "front_right")
 _START_HEIGHT = 0.5  # feet just above the floor (m)
 _START_ANGLES = (0.0, math.pi / 4) * (N_JOINTS // 2)
 _START_NOISE = 0.1  # of the joint angles (rad)
@@ -38,7 +40,7 @@ _TRAINING = (
 )
 
 
-class AntEnv(BulletEnv):
+class AntEnv(RobotEnv):
     """``FamleAnt-v0``: four legs of a hip (even joints) and an ankle (odd joints) each, at 60.6 Hz.
 
     The legs are front left, back left, back right and front right; forwards is +x, left is +y.
@@ -70,11 +72,12 @@ class AntEnv(BulletEnv):
         terminate_when_fallen: Whether a fall ends the episode.
         yaw_sensor: ``"offset"`` measures the yaw plus the ``orientation_error``, ``"stuck"`` that error alone whatever
             the yaw is, which is 0 for the intact robot: the authors' public code.
-        situation: See :class:`BulletEnv`.
-        render_mode: See :class:`BulletEnv`.
+        situation: See :class:`RobotEnv`.
+        engine: See :class:`RobotEnv`.
+        render_mode: See :class:`RobotEnv`.
 
     Raises:
-        ValueError: The control rate is outside 50 to 500 Hz, or the yaw sensor is unknown; and as :class:`BulletEnv`.
+        ValueError: The control rate is outside 50 to 500 Hz, or the yaw sensor is unknown; and as :class:`RobotEnv`.
 
     Example:
         >>> import gymnasium as gym, famle_envs
@@ -87,15 +90,19 @@ class AntEnv(BulletEnv):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 60}  # noqa: RUF012 (Gymnasium's own type)
 
-    asset = "ant.urdf"
-    joints = tuple(range(N_JOINTS))
+    body = Body(
+        "ant.urdf",
+        joints=tuple(f"{leg}_{joint}" for leg, joint in product(_LEGS, ("hip", "ankle"))),
+        height=_START_HEIGHT,
+    )
+    joints = body.joints
     supported_faults = frozenset({"motor_gain", "locked_joints", "orientation_error", "friction"})
     time_step = 1.0 / CONTROL_RATE
     physics_steps = 1
     substeps = _SUBSTEPS
     solver_iterations = 50
     quaternion_dims = (1, 2, 3, 4)
-    task_arguments = BulletEnv.task_arguments | {"terminate_when_fallen"}
+    task_arguments = RobotEnv.task_arguments | {"terminate_when_fallen"}
     training_situations = _TRAINING
     presets: ClassVar[Mapping[str, Situation]] = {situation.name: situation for situation in _TRAINING} | {
         "paper": Situation(motor_gain=(1, 1, 0), orientation_error=math.radians(45), name="paper")
@@ -108,6 +115,7 @@ class AntEnv(BulletEnv):
         terminate_when_fallen: bool = False,
         yaw_sensor: Literal["offset", "stuck"] = "offset",
         situation: Situation | Mapping[str, Any] | str | None = None,
+        engine: str | None = None,
         render_mode: str | None = None,
     ) -> None:
         if yaw_sensor not in ("offset", "stuck"):
@@ -119,7 +127,7 @@ class AntEnv(BulletEnv):
         self.terminate_when_fallen = terminate_when_fallen
         self.observation_space = spaces.Box(-np.inf, np.inf, (_OBS_DIM,))
         self.action_space = spaces.Box(-1.0, 1.0, (N_JOINTS,))
-        super().__init__(situation=situation, render_mode=render_mode)
+        super().__init__(situation=situation, engine=engine, render_mode=render_mode)
 
     def reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
         """The velocity along x after each transition.
@@ -170,44 +178,26 @@ class AntEnv(BulletEnv):
         yaw = rng.uniform(math.radians(15), math.radians(345))
         return Situation(motor_gain=(1.0,) * joint + (0.0,), orientation_error=yaw)
 
-    def _load_robot(self, path: str, client: int) -> int:
-        plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
-        self._floor = pybullet.createMultiBody(0.0, plane, physicsClientId=client)
-        start = (0.0, 0.0, _START_HEIGHT)
-        return int(pybullet.loadURDF(path, start, flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client))
-
     def _perturb_start(self) -> None:
         noise = self.np_random.uniform(-_START_NOISE, _START_NOISE, N_JOINTS)
-        for joint, angle in zip(self.joints, (noise + _START_ANGLES).tolist(), strict=True):
-            pybullet.resetJointState(self.robot, joint, angle, physicsClientId=self._world)
+        self.world.place_joints(noise + _START_ANGLES)
 
     def _apply_situation(self) -> None:
         super()._apply_situation()
         # A joint has a motor of its own, which brakes it from the start, or holds it where it was locked before.
-        pybullet.setJointMotorControlArray(
-            self.robot, self.joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * N_JOINTS, physicsClientId=self._world
-        )
+        self.world.release()
         self._torque = MAX_TORQUE * np.array(self._situation.motor_gain)
-        pybullet.changeDynamics(
-            self._floor, -1, lateralFriction=FLOOR_FRICTION * self._situation.friction, physicsClientId=self._world
-        )
+        self.world.set_floor(FLOOR_FRICTION * self._situation.friction)
 
     def actuate(self, action: Array) -> None:
         """Sets the motors for one control step."""
-        pybullet.setJointMotorControlArray(
-            self.robot,
-            self.joints,
-            pybullet.TORQUE_CONTROL,
-            forces=(self._torque * action).tolist(),
-            physicsClientId=self._world,
-        )
+        self.world.apply_torques(self._torque * action)
 
     def observe(self) -> Array:
         """Returns the observation as the sensors give it."""
-        robot, world = self.robot, self._world
-        position, quaternion = pybullet.getBasePositionAndOrientation(robot, physicsClientId=world)
-        velocity, angular_velocity = pybullet.getBaseVelocity(robot, physicsClientId=world)
-        angles, speeds, _, _ = zip(*pybullet.getJointStates(robot, self.joints, physicsClientId=world), strict=True)
+        position, quaternion = self.world.base_pose()
+        velocity, angular_velocity = self.world.base_velocity()
+        angles, speeds = self.world.joint_states()
         return np.array(
             (position[2], *self._measured(*quaternion), *angles, *velocity, *angular_velocity, *speeds),
             dtype=np.float32,
@@ -225,6 +215,6 @@ class AntEnv(BulletEnv):
     def _has_ended(self, obs: Array) -> bool:
         return self.terminate_when_fallen and bool(obs[0] < FALLEN_HEIGHT)
 
-    def _camera(self) -> dict[str, Any]:
-        position, _ = pybullet.getBasePositionAndOrientation(self.robot, physicsClientId=self._world)
-        return {"cameraTargetPosition": position, "distance": 3.0, "yaw": 15, "pitch": -25, "roll": 0}
+    def _camera(self) -> Camera:
+        position, _ = self.world.base_pose()
+        return Camera(position, distance=3.0, yaw=15.0, pitch=-25.0)

@@ -8,37 +8,39 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
-import pybullet
 from gymnasium import spaces
 
-from famle_envs.bullet_env import HOLDING_FORCE, Array, BulletEnv
+from famle_envs.engines.world import HOLDING_TORQUE, Array, Camera, Point, Quaternion
 from famle_envs.gaits import GAIT_DIM, trot
 from famle_envs.profile import SIMULATOR, Profile, resolve_profile
+from famle_envs.robot_env import RobotEnv
 from famle_envs.situation import Situation
 
 __all__ = ["GaitEnv"]
 
 _SETTLING_STEPS = 50  # until a robot that was put on the floor stands still
+_GIMBAL_LOCK = 0.99999  # sine of the pitch
 
 
-class GaitEnv(BulletEnv):
+class GaitEnv(RobotEnv):
     """Base of the robots that walk one gait a second. Between two actions the robot walks on; nothing is reset.
 
     Args:
         profile: What the body is beside its situation: ``"simulator"``, ``"held-out"``, a :class:`Profile` or a mapping
             of its fields. Agents are trained on the simulator only.
-        situation: See :class:`BulletEnv`.
-        render_mode: See :class:`BulletEnv`.
+        situation: See :class:`RobotEnv`.
+        engine: See :class:`RobotEnv`.
+        render_mode: See :class:`RobotEnv`.
 
     Raises:
-        TypeError: The profile is of another type; and as :class:`BulletEnv`.
-        ValueError: The profile is unknown or not one of this robot; and as :class:`BulletEnv`.
+        TypeError: The profile is of another type; and as :class:`RobotEnv`.
+        ValueError: The profile is unknown or not one of this robot; and as :class:`RobotEnv`.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012 (Gymnasium's own type)
 
     supported_faults = frozenset({"locked_joints", "orientation_error", "friction", "base_mass"})
-    task_arguments = BulletEnv.task_arguments | {"profile"}
+    task_arguments = RobotEnv.task_arguments | {"profile"}
     time_step = 0.01
     physics_steps = 100
     substeps = 2
@@ -61,29 +63,28 @@ class GaitEnv(BulletEnv):
         *,
         profile: Profile | Mapping[str, Any] | str = SIMULATOR,
         situation: Situation | Mapping[str, Any] | str | None = None,
+        engine: str | None = None,
         render_mode: str | None = None,
     ) -> None:
         self.profile = resolve_profile(profile, self.profiles, len(self.joints))
         self.action_space = spaces.Box(-1.0, 1.0, (GAIT_DIM,))
-        self._gains = [self.position_gain] * len(self.joints)
         seconds = self.time_step / self.substeps / self.position_gain  # in which a servo would make good an error
         self._reach = seconds * self.profile.motor_speed * self.motor_speed
         self._zero_errors = np.array(self.profile.zero_errors or (0.0,) * len(self.joints))
         self._times = self.time_step * np.arange(self.physics_steps)
-        super().__init__(situation=situation, render_mode=render_mode)
+        super().__init__(situation=situation, engine=engine, render_mode=render_mode)
 
     @abstractmethod
     def _joint_targets(self, swing: Array, lift: Array) -> Array:
         """Joint angles in rad, (n, n_joints), that give each leg the swings and lifts (n, 4) of a gait."""
 
     @property
-    def position(self) -> tuple[float, float, float]:
+    def position(self) -> Point:
         """Where the body is, in m, whatever the sensors say."""
-        x, y, z = pybullet.getBasePositionAndOrientation(self.robot, physicsClientId=self._world)[0]
-        return x, y, z
+        return self.world.base_pose()[0]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
-        """See :meth:`BulletEnv.reset`."""
+        """See :meth:`RobotEnv.reset`."""
         self._on_its_way = np.tile(self.rest_angles, (round(self.profile.latency / self.time_step), 1))
         self._geared: Array = self.rest_angles
         return super().reset(seed=seed, options=options)
@@ -95,22 +96,13 @@ class GaitEnv(BulletEnv):
         targets[:, self._blocked] = self.rest_angles[self._blocked]
         for row in targets:
             self.actuate(row)
-            pybullet.stepSimulation(physicsClientId=self._world)
+            self.world.simulate()
 
     def actuate(self, action: Array) -> None:
         """Sends the servos to joint angles, (n_joints,); no servo sees an error beyond its speed."""
-        states = pybullet.getJointStates(self.robot, self.joints, physicsClientId=self._world)
-        angles = np.array([state[0] for state in states])
+        angles, _ = self.world.joint_states()
         targets = angles + np.minimum(np.maximum(action - angles, -self._reach), self._reach)
-        pybullet.setJointMotorControlArray(
-            self.robot,
-            self.joints,
-            pybullet.POSITION_CONTROL,
-            targetPositions=targets.tolist(),
-            forces=self._forces,
-            positionGains=self._gains,
-            physicsClientId=self._world,
-        )
+        self.world.servo(targets, self._torques, self.position_gain)
 
     def _delayed(self, targets: Array) -> Array:
         """The targets that arrive in this control step, (n, n_joints), the last ones of the step before first."""
@@ -129,8 +121,8 @@ class GaitEnv(BulletEnv):
 
     def _measured_pose(self) -> tuple[list[float], list[float]]:
         """Position in m and roll, pitch and yaw in rad as the sensors give them; angles are not wrapped."""
-        position, quaternion = pybullet.getBasePositionAndOrientation(self.robot, physicsClientId=self._world)
-        roll, pitch, yaw = pybullet.getEulerFromQuaternion(quaternion)
+        position, quaternion = self.world.base_pose()
+        roll, pitch, yaw = roll_pitch_yaw(quaternion)
         angles = [roll, pitch, yaw + self._situation.orientation_error]
         profile = self.profile
         if profile.position_noise or profile.orientation_noise:
@@ -139,55 +131,36 @@ class GaitEnv(BulletEnv):
             angles = angles + profile.orientation_noise * noise[3:]
         return list(position), list(angles)
 
-    def _load_robot(self, path: str, client: int) -> int:
-        plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
-        self._floor = pybullet.createMultiBody(0.0, plane, physicsClientId=client)
-        robot = self._place_robot(path, client)
-        links = range(-1, pybullet.getNumJoints(robot, physicsClientId=client))
-        self._as_built = {link: pybullet.getDynamicsInfo(robot, link, physicsClientId=client) for link in links}
-        info = [pybullet.getJointInfo(robot, joint, physicsClientId=client) for joint in self.joints]
-        self._damping_as_built = [row[6] for row in info]
-        pybullet.setJointMotorControlArray(
-            robot,
-            self.joints,
-            pybullet.POSITION_CONTROL,
-            targetPositions=self.rest_angles.tolist(),
-            forces=[self.motor_torque] * len(self.joints),
-            physicsClientId=client,
-        )
-        for _ in range(_SETTLING_STEPS):
-            pybullet.stepSimulation(physicsClientId=client)
-        return robot
-
-    @abstractmethod
-    def _place_robot(self, path: str, client: int) -> int:
-        """Loads the robot at rest above the origin."""
+    def _settle(self) -> None:
+        self.world.servo(self.rest_angles, np.full(len(self.joints), self.motor_torque))
+        self.world.simulate(_SETTLING_STEPS)
 
     def _apply_situation(self) -> None:
         super()._apply_situation()
         profile, situation = self.profile, self._situation
         self._blocked = list(situation.locked_joints)
-        self._forces = [profile.motor_strength * self.motor_torque] * len(self.joints)
-        for joint in self._blocked:
-            self._forces[joint] = HOLDING_FORCE
-        for link, built in self._as_built.items():
-            factor = profile.base_mass * situation.base_mass if link == -1 else profile.leg_mass
-            self._change(self.robot, link, mass=factor * built[0])
-            self._change(self.robot, link, localInertiaDiagonal=[factor * value for value in built[2]])
-        for joint, built in zip(self.joints, self._damping_as_built, strict=True):
-            self._change(self.robot, joint, jointDamping=built + profile.joint_damping)
+        self._torques = np.full(len(self.joints), profile.motor_strength * self.motor_torque)
+        self._torques[self._blocked] = HOLDING_TORQUE
+        self.world.scale_masses(profile.base_mass * situation.base_mass, profile.leg_mass)
+        self.world.add_damping(profile.joint_damping)
         friction = self.floor_friction * profile.floor_friction * situation.friction
-        self._change(self._floor, -1, lateralFriction=friction)
-        if profile.contact_stiffness:
-            stiffness, damping = profile.contact_stiffness, profile.contact_damping
-            self._change(self._floor, -1, contactStiffness=stiffness, contactDamping=damping)
+        self.world.set_floor(friction, profile.contact_stiffness, profile.contact_damping)
 
-    def _change(self, body: int, link: int, **dynamics: Any) -> None:
-        pybullet.changeDynamics(body, link, physicsClientId=self._world, **dynamics)
-
-    def _camera(self) -> dict[str, Any]:
+    def _camera(self) -> Camera:
         x, y, _ = self.position
-        return {"cameraTargetPosition": (x, y, 0.0), "distance": 1.2, "yaw": 30, "pitch": -35, "roll": 0}
+        return Camera((x, y, 0.0), distance=1.2, yaw=30.0, pitch=-35.0)
+
+
+def roll_pitch_yaw(quaternion: Quaternion) -> Point:
+    """The angles in rad about x, y and z, one after the other, of a unit quaternion x, y, z, w."""
+    x, y, z, w = quaternion
+    sine = -2.0 * (x * z - w * y)
+    if abs(sine) >= _GIMBAL_LOCK:  # where only roll and yaw together are known
+        side = math.copysign(1.0, sine)
+        return 0.0, side * math.pi / 2, 2.0 * math.atan2(-side * x, side * y)
+    xx, yy, zz, ww = x * x, y * y, z * z, w * w
+    roll = math.atan2(2.0 * (y * z + w * x), ww - xx - yy + zz)
+    return roll, math.asin(sine), math.atan2(2.0 * (x * y + w * z), ww + xx - yy - zz)
 
 
 def wrapped(angle: float) -> float:

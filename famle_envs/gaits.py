@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from famle_envs.bullet_env import Array
+from famle_envs.engines.world import Array
 
 __all__ = ["GAIT_DIM", "trot"]
 

@@ -4,31 +4,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from importlib.resources import files
 from itertools import product
 from typing import Any, ClassVar
 
 import numpy as np
-import pybullet
 from gymnasium import spaces
 
-from famle_envs.bullet_env import Array
+from famle_envs.engines.world import Array, Body, Point
 from famle_envs.gait_env import GaitEnv, wrapped
 from famle_envs.profile import SIMULATOR, Profile
 from famle_envs.situation import Situation
 
 __all__ = ["HELD_OUT", "MinitaurEnv"]
 
-_MOTORS = (23, 20, 17, 14, 1, 4, 7, 10)  # PyBullet's indices: right and left motor of each leg
-_KNEE_OF_MOTOR = 2  # its index beyond the motor's
+_SIDES = tuple(f"{leg}{side}" for leg, side in product(("back_left", "front_left", "front_right", "back_right"), "RL"))
 _LEG_SIDE = np.array([-1.0, -1.0, 1.0, 1.0])  # sense in which both motors of a leg lengthen it
 _REST = math.pi / 2  # of a motor: the leg is half extended (rad)
 _KNEE_AT_REST = 2.18
 _FULL_SWING = 1.2  # of a leg, where the gait says 1 (rad)
 _FULL_LIFT = 1.0  # of both motors of a leg, where the gait says 1 (rad)
-_CLOSURE = ((0.0, 0.005, 0.2), (0.0, 0.01, 0.2))  # where the two shanks of a leg meet, in the frame of each (m)
+_CLOSURE: tuple[Point, Point] = ((0.0, 0.005, 0.2), (0.0, 0.01, 0.2))  # where the shanks of a leg meet, in each (m)
 _START_HEIGHT = 0.19
 _FALLEN_TILT = math.cos(math.radians(50))
+
+
+def _body() -> Body:
+    motors = tuple(f"motor_{side}_joint" for side in _SIDES)
+    angles: dict[str, float] = {}
+    for side, motor, sense in zip(_SIDES, motors, np.repeat(_LEG_SIDE, 2).tolist(), strict=True):
+        angles |= {motor: sense * _REST, f"knee_{side}_link": -sense * _KNEE_AT_REST}
+    shanks = [f"lower_leg_{side}_link" for side in _SIDES]
+    loops = ((((right, _CLOSURE[0]), (left, _CLOSURE[1]))) for right, left in zip(shanks[::2], shanks[1::2], strict=True))
+    return Body("minitaur.urdf", motors, height=_START_HEIGHT, start_angles=angles, loops=tuple(loops))
+
+
 
 HELD_OUT = Profile(
     name="held-out",
@@ -59,7 +68,7 @@ _TRAINING = (
 
 
 class MinitaurEnv(GaitEnv):
-    """``FamleMinitaur-v0``: PyBullet's model of the Minitaur, one gait a second.
+    """``FamleMinitaur-v0``: the Minitaur of PyBullet's models, one gait a second.
 
     Each leg is a closed loop of four bars driven by two motors; motors are counted leg by leg: back left, front left,
     front right, back right.
@@ -83,8 +92,9 @@ class MinitaurEnv(GaitEnv):
 
     Args:
         profile: See :class:`GaitEnv`.
-        situation: See :class:`BulletEnv`.
-        render_mode: See :class:`BulletEnv`.
+        situation: See :class:`RobotEnv`.
+        engine: See :class:`RobotEnv`.
+        render_mode: See :class:`RobotEnv`.
 
     Example:
         >>> import gymnasium as gym, famle_envs
@@ -95,9 +105,8 @@ class MinitaurEnv(GaitEnv):
         >>> env.close()
     """
 
-    asset_folder = files("pybullet_data")
-    asset = "quadruped/minitaur.urdf"
-    joints = _MOTORS
+    body = _body()
+    joints = body.joints
     floor_friction = 1.0
     motor_torque = 5.0
     motor_speed = 6.0
@@ -114,11 +123,12 @@ class MinitaurEnv(GaitEnv):
         *,
         profile: Profile | Mapping[str, Any] | str = SIMULATOR,
         situation: Situation | Mapping[str, Any] | str | None = None,
+        engine: str | None = None,
         render_mode: str | None = None,
     ) -> None:
         high = np.array([np.inf, np.inf, np.inf, np.pi, np.pi, np.pi], dtype=np.float32)
         self.observation_space = spaces.Box(-high, high)
-        super().__init__(profile=profile, situation=situation, render_mode=render_mode)
+        super().__init__(profile=profile, situation=situation, engine=engine, render_mode=render_mode)
 
     def reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
         """The way along x of each transition, x' - x.
@@ -147,7 +157,7 @@ class MinitaurEnv(GaitEnv):
     def _joint_targets(self, swing: Array, lift: Array) -> Array:
         length = _LEG_SIDE * (_REST - _FULL_LIFT * lift)
         forwards = -_FULL_SWING * swing
-        return np.stack([length + forwards, length - forwards], axis=2).reshape(len(swing), len(_MOTORS))
+        return np.stack([length + forwards, length - forwards], axis=2).reshape(len(swing), len(_SIDES))
 
     def observe(self) -> Array:
         """Returns the observation as the sensors give it."""
@@ -155,19 +165,5 @@ class MinitaurEnv(GaitEnv):
         return np.array((*position, *(wrapped(angle) for angle in angles)), dtype=np.float32)
 
     def _has_ended(self, obs: Array) -> bool:
-        _, quaternion = pybullet.getBasePositionAndOrientation(self.robot, physicsClientId=self._world)
-        return bool(pybullet.getMatrixFromQuaternion(quaternion)[8] < _FALLEN_TILT)
-
-    def _place_robot(self, path: str, client: int) -> int:
-        robot = pybullet.loadURDF(path, (0.0, 0.0, _START_HEIGHT), physicsClientId=client)
-        for motor, angle in zip(self.joints, self.rest_angles.tolist(), strict=True):
-            knee = motor + _KNEE_OF_MOTOR
-            pybullet.resetJointState(robot, motor, angle, physicsClientId=client)
-            pybullet.resetJointState(robot, knee, -math.copysign(_KNEE_AT_REST, angle), physicsClientId=client)
-            # A joint has a motor of its own, which would brake the knee.
-            pybullet.setJointMotorControl2(robot, knee, pybullet.VELOCITY_CONTROL, force=0.0, physicsClientId=client)
-        for right, left in zip(self.joints[::2], self.joints[1::2], strict=True):
-            knees = (robot, right + _KNEE_OF_MOTOR, robot, left + _KNEE_OF_MOTOR)
-            free_axis, kind = (0.0, 0.0, 0.0), pybullet.JOINT_POINT2POINT
-            pybullet.createConstraint(*knees, kind, free_axis, *_CLOSURE, physicsClientId=client)
-        return int(robot)
+        _, (qx, qy, _, _) = self.world.base_pose()
+        return 1.0 - 2.0 * (qx * qx + qy * qy) < _FALLEN_TILT

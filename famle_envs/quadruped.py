@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import product
 from typing import Any, ClassVar
 
 import numpy as np
-import pybullet
 from gymnasium import spaces
 
 from famle_envs.arguments import finite_point, number_within
-from famle_envs.bullet_env import Array
+from famle_envs.engines.world import Array, Body, Marker
 from famle_envs.gait_env import GaitEnv
 from famle_envs.profile import SIMULATOR, Profile
 from famle_envs.situation import Situation
@@ -19,6 +19,7 @@ from famle_envs.situation import Situation
 __all__ = ["HELD_OUT", "LEGS", "QuadrupedEnv"]
 
 LEGS = ("back left", "front left", "front right", "back right")
+_JOINTS = tuple(f"{leg.replace(' ', '_')}_{joint}" for leg, joint in product(LEGS, ("hip", "thigh", "shank")))
 _JOINTS_OF_A_LEG = 3
 _N_JOINTS = _JOINTS_OF_A_LEG * len(LEGS)
 _FULL_SWING = math.pi / 4  # of a joint, where the gait says 1 (rad)
@@ -88,8 +89,9 @@ class QuadrupedEnv(GaitEnv):
         goal: x and y in m; the robot starts at the origin and looks along +x.
         success_radius: Distance from the goal that counts as reaching it, in m.
         profile: See :class:`GaitEnv`.
-        situation: See :class:`BulletEnv`.
-        render_mode: See :class:`BulletEnv`.
+        situation: See :class:`RobotEnv`.
+        engine: See :class:`RobotEnv`.
+        render_mode: See :class:`RobotEnv`.
 
     Raises:
         ValueError: The goal or the radius is no length in m; and as :class:`GaitEnv`.
@@ -103,8 +105,8 @@ class QuadrupedEnv(GaitEnv):
         >>> env.close()
     """
 
-    asset = "quadruped.urdf"
-    joints = tuple(range(_N_JOINTS))
+    body = Body("quadruped.urdf", joints=_JOINTS, height=_START_HEIGHT)
+    joints = body.joints
     floor_friction = 1.0
     motor_torque = 30.0
     motor_speed = 7.0
@@ -124,13 +126,14 @@ class QuadrupedEnv(GaitEnv):
         success_radius: float = 0.25,
         profile: Profile | Mapping[str, Any] | str = SIMULATOR,
         situation: Situation | Mapping[str, Any] | str | None = None,
+        engine: str | None = None,
         render_mode: str | None = None,
     ) -> None:
         self.goal = finite_point("goal", goal)
         self.success_radius = number_within("success_radius", success_radius, 0.01, 100.0, "m")
         high = np.array([np.inf, np.inf, 1.0, 1.0], dtype=np.float32)
         self.observation_space = spaces.Box(-high, high)
-        super().__init__(profile=profile, situation=situation, render_mode=render_mode)
+        super().__init__(profile=profile, situation=situation, engine=engine, render_mode=render_mode)
 
     def reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
         """|p - goal| - |p' - goal| of each transition.
@@ -181,15 +184,5 @@ class QuadrupedEnv(GaitEnv):
     def _info(self) -> dict[str, Any]:
         return {**super()._info(), "is_success": self._is_success()}
 
-    def _place_robot(self, path: str, client: int) -> int:
-        if self.render_mode is not None:
-            ring = pybullet.createVisualShape(
-                pybullet.GEOM_CYLINDER,
-                radius=self.success_radius,
-                length=0.002,
-                rgbaColor=(0.15, 0.65, 0.3, 1.0),
-                physicsClientId=client,
-            )
-            pybullet.createMultiBody(baseVisualShapeIndex=ring, basePosition=(*self.goal, 0.0), physicsClientId=client)
-        flags = pybullet.URDF_USE_INERTIA_FROM_FILE
-        return int(pybullet.loadURDF(path, (0.0, 0.0, _START_HEIGHT), flags=flags, physicsClientId=client))
+    def _marker(self) -> Marker:
+        return Marker((*self.goal, 0.0), radius=self.success_radius, height=0.002)

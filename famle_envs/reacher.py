@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
-import pybullet
 from gymnasium import spaces
 
 from famle_envs.arguments import finite_point
-from famle_envs.bullet_env import Array, BulletEnv
+from famle_envs.engines.world import Array, Body, Camera, Marker
+from famle_envs.robot_env import RobotEnv
 from famle_envs.situation import Situation
 
 __all__ = ["ReacherEnv"]
@@ -21,7 +21,6 @@ LINK_LENGTH = 0.3
 MAX_SPEED = 0.7  # of a joint at action 1 (rad/s)
 MAX_FORCE = 200.0  # of a motor (N m)
 SENSED_SPEED = 10.0  # where the velocity sensors saturate (rad/s)
-_TIP_LINK = N_JOINTS
 _TIP_X, _TIP_Y = 2 * N_JOINTS, 2 * N_JOINTS + 1
 
 
@@ -37,7 +36,7 @@ _TRAINING = (
 )
 
 
-class ReacherEnv(BulletEnv):
+class ReacherEnv(RobotEnv):
     """``FamleReacher-v0``: a planar arm of five 0.3 m links with velocity-controlled joints, at 10 Hz.
 
     ## Action
@@ -56,11 +55,12 @@ class ReacherEnv(BulletEnv):
 
     Args:
         goal: Where the tip should go: x, y in m from the base; the arm reaches 1.5 m.
-        situation: See :class:`BulletEnv`.
-        render_mode: See :class:`BulletEnv`.
+        situation: See :class:`RobotEnv`.
+        engine: See :class:`RobotEnv`.
+        render_mode: See :class:`RobotEnv`.
 
     Raises:
-        ValueError: The goal is not two finite numbers; and as :class:`BulletEnv`.
+        ValueError: The goal is not two finite numbers; and as :class:`RobotEnv`.
 
     Example:
         >>> import gymnasium as gym, famle_envs
@@ -71,13 +71,13 @@ class ReacherEnv(BulletEnv):
         >>> env.close()
     """
 
-    asset = "reacher.urdf"
-    joints = tuple(range(N_JOINTS))
+    body = Body("reacher.urdf", joints=tuple(f"joint_{i}" for i in range(5)), fixed=True)
+    joints = body.joints
     supported_faults = frozenset({"motor_gain", "locked_joints", "joint_offset"})
     time_step = 0.004
     physics_steps = 25
     angle_dims = tuple(range(N_JOINTS))
-    task_arguments = BulletEnv.task_arguments | {"goal"}
+    task_arguments = RobotEnv.task_arguments | {"goal"}
     training_situations = _TRAINING
     presets: ClassVar[Mapping[str, Situation]] = {situation.name: situation for situation in _TRAINING} | {
         "paper": Situation(motor_gain=(-1, 1, 1, 0, 1), name="paper")
@@ -88,6 +88,7 @@ class ReacherEnv(BulletEnv):
         *,
         goal: tuple[float, float] = (-1.0, 1.0),
         situation: Situation | Mapping[str, Any] | str | None = None,
+        engine: str | None = None,
         render_mode: str | None = None,
     ) -> None:
         self.goal = finite_point("goal", goal)
@@ -95,7 +96,7 @@ class ReacherEnv(BulletEnv):
         high = np.array([math.pi] * N_JOINTS + [SENSED_SPEED] * N_JOINTS + [1.1 * reach] * 2, dtype=np.float32)
         self.observation_space = spaces.Box(-high, high)
         self.action_space = spaces.Box(-1.0, 1.0, (N_JOINTS,))
-        super().__init__(situation=situation, render_mode=render_mode)
+        super().__init__(situation=situation, engine=engine, render_mode=render_mode)
 
     def reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
         """exp(-|tip' - goal|) of each transition.
@@ -147,42 +148,24 @@ class ReacherEnv(BulletEnv):
             if situation not in cls.training_situations:
                 return situation
 
-    def _load_robot(self, path: str, client: int) -> int:
-        robot = pybullet.loadURDF(path, useFixedBase=True, physicsClientId=client)
-        if self.render_mode is not None:
-            marker = pybullet.createVisualShape(
-                pybullet.GEOM_SPHERE, radius=0.06, rgbaColor=(0.15, 0.65, 0.3, 1.0), physicsClientId=client
-            )
-            pybullet.createMultiBody(
-                baseVisualShapeIndex=marker, basePosition=(*self.goal, 0.04), physicsClientId=client
-            )
-        return int(robot)
+    def _marker(self) -> Marker:
+        return Marker((*self.goal, 0.04), radius=0.06)
 
     def actuate(self, action: Array) -> None:
         """Sets the motors for one control step."""
         speed = MAX_SPEED * np.clip(np.multiply(self._situation.motor_gain, action), -1.0, 1.0)
         # A servo stops at its joint's end. One that pushed on against it would turn the whole arm in this simulator.
-        states = pybullet.getJointStates(self.robot, self.joints, physicsClientId=self._world)
-        lower, upper = (self.joint_limits - np.array([state[0] for state in states])) / self.control_period
-        pybullet.setJointMotorControlArray(
-            self.robot,
-            self.joints,
-            pybullet.VELOCITY_CONTROL,
-            targetVelocities=np.clip(speed, lower, upper).tolist(),
-            forces=[MAX_FORCE] * N_JOINTS,
-            physicsClientId=self._world,
-        )
+        angles, _ = self.world.joint_states()
+        lower, upper = (self.joint_limits - angles) / self.control_period
+        self.world.turn(np.clip(speed, lower, upper), MAX_FORCE)
 
     def observe(self) -> Array:
         """Returns the observation as the sensors give it."""
-        states = pybullet.getJointStates(self.robot, self.joints, physicsClientId=self._world)
-        angles = np.array([state[0] for state in states]) + self._situation.joint_offset
-        velocities = np.clip([state[1] for state in states], -SENSED_SPEED, SENSED_SPEED)
-        tip = pybullet.getLinkState(self.robot, _TIP_LINK, computeForwardKinematics=True, physicsClientId=self._world)[
-            4
-        ]
-        wrapped = (angles + math.pi) % (2 * math.pi) - math.pi
+        angles, speeds = self.world.joint_states()
+        wrapped = (angles + self._situation.joint_offset + math.pi) % (2 * math.pi) - math.pi
+        velocities = np.clip(speeds, -SENSED_SPEED, SENSED_SPEED)
+        tip = self.world.link_position("tip")
         return np.concatenate([wrapped, velocities, tip[:2]]).astype(np.float32)
 
-    def _camera(self) -> dict[str, Any]:
-        return {"cameraTargetPosition": (0.0, 0.0, 0.0), "distance": 3.0, "yaw": 0, "pitch": -89.9, "roll": 0}
+    def _camera(self) -> Camera:
+        return Camera((0.0, 0.0, 0.0), distance=3.0, yaw=0.0, pitch=-89.9)

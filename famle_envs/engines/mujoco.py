@@ -1,0 +1,311 @@
+"""Robots in MuJoCo, from the same descriptions and under the same laws of motors and contacts as in PyBullet.
+
+A constraint there is an error that is to vanish within a step: a motor's or a contact's speed at once, a distance by
+:data:`_ERROR_REDUCTION` a step. MuJoCo's constraints are accelerations with a reference, so that this takes
+
+    a_ref = -v / dt - erp r / dt^2,
+
+which its time constant 2 dt and damping ratio 1 / sqrt(4 erp) say.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Mapping
+from importlib.resources import files
+from typing import Any
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from famle_envs.engines.world import (
+    DEFAULT_GAIN,
+    FAULTY_COLOUR,
+    FIELD_OF_VIEW,
+    GRAVITY,
+    HOLDING_TORQUE,
+    MARKER_COLOUR,
+    PICTURE_SIZE,
+    Array,
+    Body,
+    Camera,
+    Marker,
+    Point,
+    Quaternion,
+    Steps,
+)
+
+__all__ = ["MujocoWorld"]
+
+_ERROR_REDUCTION = 0.2  # PyBullet's
+_LINK_FRICTION = 0.5  # PyBullet's, of a link whose description has none
+_LINK_DAMPING = 0.1  # the same, of contacts (N s/m)
+_RIGIDITY = 0.999  # of constraints, where 1 would have no give at all
+_FRICTION_RIGIDITY = 100.0  # times that of the pressure, so that no foot creeps on a soft floor
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+_SEEN = 1  # the group of the shapes in a picture; those that collide are in group 0
+_FLOOR_COLOUR, _SKY_COLOUR = (0.75, 0.75, 0.78, 1.0), (0.92, 0.92, 0.95)
+
+
+class MujocoWorld:
+    """A :class:`~famle_envs.engines.world.World`, which documents the methods, of a MuJoCo model.
+
+    Attributes:
+        model: The ``mujoco.MjModel``.
+        data: Its ``mujoco.MjData``.
+    """
+
+    def __init__(self, body: Body, steps: Steps, marker: Marker | None) -> None:
+        description = ElementTree.fromstring((files("famle_envs") / "assets" / body.description).read_text())
+        self.model = _compile(description, body, marker)
+        self.data = mujoco.MjData(self.model)
+        self._set_laws(steps)
+        self._substeps = steps.substeps
+        self._base = int(self.model.body_rootid[-1])
+        joints = np.array([self.model.joint(name).id for name in body.joints])
+        self._angle_at, self._speed_at = self.model.jnt_qposadr[joints], self.model.jnt_dofadr[joints]
+        self._link_of_joint = self.model.jnt_bodyid[joints]
+        limits = np.where(self.model.jnt_limited[joints] != 0, self.model.jnt_range[joints].T, [[-np.inf], [np.inf]])
+        self.joint_limits: Array = limits
+        self._targets, self._gains, self._speeds = np.zeros((3, len(joints)))
+        self._driven = np.empty(0, dtype=np.intp)
+        names = ("body_mass", "body_inertia", "dof_damping", "geom_rgba")
+        self._as_built = {name: getattr(self.model, name).copy() for name in names}
+        self._contacts = _Contacts(description, self.model)
+        self._floor = (1.0, 0.0, 0.0)
+        self._pictures: _Pictures | None = None
+        for name, angle in body.start_angles.items():
+            self.data.joint(name).qpos[:] = angle
+        self._start = np.empty(mujoco.mj_stateSize(self.model, _STATE))
+
+    def _set_laws(self, steps: Steps) -> None:
+        model, option = self.model, self.model.opt
+        option.timestep = steps.time_step / steps.substeps
+        option.gravity[:] = (0.0, 0.0, -GRAVITY)
+        option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        option.impratio = _FRICTION_RIGIDITY
+        # Damping within the step would take from a motor what its constraint has given.
+        option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+        law = (2.0 * option.timestep, 1.0 / math.sqrt(4.0 * _ERROR_REDUCTION))
+        for constraint in ("eq", "jnt", "geom", "dof"):
+            getattr(model, f"{constraint}_solref")[:] = law
+            getattr(model, f"{constraint}_solimp")[:, :2] = _RIGIDITY
+
+    def set_start(self) -> None:
+        mujoco.mj_getState(self.model, self.data, self._start, _STATE)
+
+    def restart(self) -> None:
+        mujoco.mj_setState(self.model, self.data, self._start, _STATE)
+
+    def simulate(self, calls: int = 1) -> None:
+        model, data, motors = self.model, self.data, self._driven
+        if not len(motors):
+            mujoco.mj_step(model, data, nstep=calls * self._substeps)
+        else:
+            angle_at, speed_at = self._angle_at[motors], self._speed_at[motors]
+            targets, gains, speeds = self._targets[motors], self._gains[motors], self._speeds[motors]
+            dt = model.opt.timestep
+            for _ in range(calls * self._substeps):
+                mujoco.mj_step1(model, data)
+                wanted = speeds + gains * (targets - data.qpos[angle_at]) / dt
+                # A motor is friction of a bounded torque against something that moves at the wanted speed.
+                data.efc_aref[data.ne : data.ne + data.nf] = (wanted - data.qvel[speed_at]) / dt
+                mujoco.mj_step2(model, data)
+        data.qfrc_applied[:] = 0.0
+
+    def close(self) -> None:
+        if self._pictures is not None:
+            self._pictures.close()
+            self._pictures = None
+
+    def joint_states(self) -> tuple[Array, Array]:
+        return self.data.qpos[self._angle_at], self.data.qvel[self._speed_at]
+
+    def base_pose(self) -> tuple[Point, Quaternion]:
+        x, y, z, qw, qx, qy, qz = self.data.qpos[:7].tolist()
+        return (x, y, z), (qx, qy, qz, qw)
+
+    def base_velocity(self) -> tuple[Point, Point]:
+        turning = np.empty(3)
+        mujoco.mju_rotVecQuat(turning, self.data.qvel[3:6], self.data.qpos[3:7])  # MuJoCo's is in the base's axes
+        vx, vy, vz, wx, wy, wz = (*self.data.qvel[:3].tolist(), *turning.tolist())
+        return (vx, vy, vz), (wx, wy, wz)
+
+    def link_position(self, link: str) -> Point:
+        mujoco.mj_kinematics(self.model, self.data)  # which a step does before it moves on
+        x, y, z = self.data.body(link).xpos.tolist()
+        return x, y, z
+
+    def place_joints(self, angles: Array) -> None:
+        self.data.qpos[self._angle_at] = angles
+        self.data.qvel[self._speed_at] = 0.0
+
+    def release(self) -> None:
+        self.model.dof_frictionloss[self._speed_at] = 0.0
+        self._find_driven()
+
+    def apply_torques(self, torques: Array) -> None:
+        self.data.qfrc_applied[self._speed_at] = torques
+
+    def turn(self, speeds: Array, torque: float) -> None:
+        self._speeds[:], self._gains[:] = speeds, 0.0
+        self.model.dof_frictionloss[self._speed_at] = torque
+        self._find_driven()
+
+    def servo(self, angles: Array, torques: Array, gain: float = DEFAULT_GAIN) -> None:
+        self._speeds[:], self._gains[:], self._targets[:] = 0.0, gain, angles
+        self.model.dof_frictionloss[self._speed_at] = torques
+        self._find_driven()
+
+    def hold(self, angles: Mapping[int, float]) -> None:
+        joints = list(angles)
+        self._speeds[joints], self._gains[joints], self._targets[joints] = 0.0, DEFAULT_GAIN, list(angles.values())
+        self.model.dof_frictionloss[self._speed_at[joints]] = HOLDING_TORQUE
+        self._find_driven()
+
+    def _find_driven(self) -> None:
+        """Finds the motors with any torque, in the order of the model's frictions."""
+        order = np.argsort(self._speed_at)
+        self._driven = order[self.model.dof_frictionloss[self._speed_at[order]] > 0.0]
+
+    def set_floor(self, friction: float, stiffness: float = 0.0, damping: float = 0.0) -> None:
+        self._floor = friction, stiffness, damping
+        self._contacts.apply(self.model, *self._floor)
+
+    def scale_masses(self, base: float, links: float) -> None:
+        factor = np.full(self.model.nbody, links)
+        factor[self._base] = base
+        self.model.body_mass[:] = factor * self._as_built["body_mass"]
+        self.model.body_inertia[:] = factor[:, None] * self._as_built["body_inertia"]
+        mujoco.mj_setConst(self.model, mujoco.MjData(self.model))  # which would move the robot in its own data
+        self._contacts.apply(self.model, *self._floor)
+
+    def add_damping(self, damping: float) -> None:
+        self.model.dof_damping[self._speed_at] = self._as_built["dof_damping"][self._speed_at] + damping
+
+    def paint(self, joints: frozenset[int]) -> None:
+        faulty = np.isin(self.model.geom_bodyid, self._link_of_joint[list(joints)])
+        self.model.geom_rgba[:] = np.where(faulty[:, None], FAULTY_COLOUR, self._as_built["geom_rgba"])
+
+    def picture(self, camera: Camera) -> npt.NDArray[np.uint8]:
+        if self._pictures is None:
+            self._pictures = _Pictures(self.model)
+        mujoco.mj_kinematics(self.model, self.data)
+        return self._pictures.take(self.model, self.data, camera)
+
+
+def _compile(description: ElementTree.Element, body: Body, marker: Marker | None) -> Any:
+    """The model of a robot and what stands around it."""
+    extension = ElementTree.SubElement(description, "mujoco")
+    ElementTree.SubElement(extension, "compiler", discardvisual="false", fusestatic="false")
+    spec = mujoco.MjSpec.from_string(ElementTree.tostring(description, encoding="unicode"))
+    world, seen = spec.worldbody, {"group": _SEEN, "contype": 0, "conaffinity": 0}
+    base = world.first_body()
+    if not body.fixed:
+        base.add_freejoint()
+        base.pos = (0.0, 0.0, body.height)
+    # A plane touches what is in the world's way, but no link another.
+    for geom in spec.geoms:
+        geom.contype, geom.conaffinity, geom.priority = int(geom.group != _SEEN), 0, 1
+    if not body.fixed:
+        floor = {**seen, "conaffinity": 1}
+        world.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 1.0), rgba=_FLOOR_COLOUR, **floor)
+    for ends in body.loops:
+        sites = [spec.body(link).add_site(name=f"{link} end", pos=point).name for link, point in ends]
+        spec.add_equality(
+            type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_SITE, name1=sites[0], name2=sites[1]
+        )
+    if marker is not None:
+        kind = mujoco.mjtGeom.mjGEOM_CYLINDER if marker.height else mujoco.mjtGeom.mjGEOM_SPHERE
+        size = (marker.radius, 0.5 * marker.height, 0.0)
+        world.add_geom(type=kind, size=size, pos=marker.position, rgba=MARKER_COLOUR, **seen)
+    sky = {"type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mujoco.mjtBuiltin.mjBUILTIN_FLAT}
+    spec.add_texture(name="sky", rgb1=_SKY_COLOUR, rgb2=_SKY_COLOUR, width=8, height=8, **sky)
+    spec.visual.global_.fovy = FIELD_OF_VIEW
+    spec.visual.global_.offwidth = spec.visual.global_.offheight = PICTURE_SIZE
+    return spec.compile()
+
+
+class _Contacts:
+    """How the links of a robot touch the floor; all of it is kept in their shapes, which outrank the floor's."""
+
+    def __init__(self, description: ElementTree.Element, model: Any) -> None:
+        self._geoms = np.flatnonzero(model.geom_contype)
+        self._links = model.geom_bodyid[self._geoms]
+        names = [model.body(link).name for link in self._links]
+        said = {link.get("name"): link.find("contact") for link in description.iter("link")}
+
+        def values(name: str, default: float) -> Array:
+            elements = [None if said[link] is None else said[link].find(name) for link in names]
+            return np.array([default if element is None else float(element.get("value", 0)) for element in elements])
+
+        self._friction = values("lateral_friction", _LINK_FRICTION)
+        self._stiffness, self._damping = values("stiffness", math.inf), values("damping", _LINK_DAMPING)
+        self._rigid_law = model.geom_solref[0].copy() if model.ngeom else None
+
+    def apply(self, model: Any, friction: float, stiffness: float, damping: float) -> None:
+        """Combines the floor's with each link's: frictions multiply, springs are in series, dampings add up."""
+        model.geom_friction[self._geoms, 0] = friction * self._friction
+        model.geom_solref[self._geoms], model.geom_solimp[self._geoms, :2] = self._rigid_law, _RIGIDITY
+        spring = 1.0 / (1.0 / self._stiffness + (1.0 / stiffness if stiffness else 0.0) + 1e-18)
+        soft = spring < 1e17
+        dt, spring = model.opt.timestep, spring[soft]
+        damper = self._damping[soft] + (damping if stiffness else _LINK_DAMPING)
+        # A spring and a damper at the end of a step are f = -(k dt + c) (v + a dt) - k r = (a_ref - a) / give,
+        give = 1.0 / (dt * (spring * dt + damper))
+        # which MuJoCo has where the rigidity is the part of the give that is the link's own.
+        own = model.body_invweight0[self._links[soft], 0]
+        rigidity = np.clip(own / (own + give), 1e-4, 0.9999)
+        law = np.stack([-rigidity * spring * give, -rigidity / dt * np.ones_like(give)], axis=1)
+        model.geom_solref[self._geoms[soft]] = law
+        model.geom_solimp[self._geoms[soft], :2] = rigidity[:, None]
+
+
+class _Pictures:
+    """Renders a model without a window."""
+
+    def __init__(self, model: Any) -> None:
+        try:
+            self._context = _gl_context()(PICTURE_SIZE, PICTURE_SIZE)
+            self._context.make_current()
+            self._renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        except Exception as error:  # each platform library has exceptions of its own
+            raise RuntimeError(
+                "MuJoCo found no OpenGL to render with. Without a screen it needs EGL (package libegl1 on Debian) or "
+                "OSMesa (libosmesa6, and MUJOCO_GL=osmesa in the environment); or use engine='pybullet'."
+            ) from error
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._renderer)
+        self._scene = mujoco.MjvScene(model, maxgeom=1000)
+        self._options = mujoco.MjvOption()
+        self._options.geomgroup[0] = 0  # shapes that collide, in front of those that one sees
+
+    def take(self, model: Any, data: Any, camera: Camera) -> npt.NDArray[np.uint8]:
+        self._context.make_current()
+        view = mujoco.MjvCamera()
+        view.lookat[:], view.distance = camera.target, camera.distance
+        view.azimuth, view.elevation = camera.yaw + 90.0, camera.pitch
+        mujoco.mjv_updateScene(model, data, self._options, None, view, mujoco.mjtCatBit.mjCAT_ALL, self._scene)
+        pixels = np.empty((PICTURE_SIZE, PICTURE_SIZE, 3), dtype=np.uint8)
+        rect = mujoco.MjrRect(0, 0, PICTURE_SIZE, PICTURE_SIZE)
+        mujoco.mjr_render(rect, self._scene, self._renderer)
+        mujoco.mjr_readPixels(pixels, None, rect, self._renderer)
+        return np.flipud(pixels).copy()
+
+    def close(self) -> None:
+        self._context.make_current()
+        self._renderer.free()
+        self._context.free()
+
+
+def _gl_context() -> Any:
+    """MuJoCo's own choice, which is a window of the screen; EGL where there is none."""
+    on_a_screen = {"DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"} & set(os.environ)
+    if sys.platform == "linux" and not on_a_screen:
+        from mujoco.egl import GLContext
+
+        return GLContext
+    return mujoco.GLContext
