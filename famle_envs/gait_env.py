@@ -119,17 +119,17 @@ class GaitEnv(RobotEnv):
             geared[t] = self._geared
         return geared
 
-    def _measured_pose(self) -> tuple[list[float], list[float]]:
+    def _measured_pose(self) -> tuple[Array, Array]:
         """Position in m and roll, pitch and yaw in rad as the sensors give them; angles are not wrapped."""
         position, quaternion = self.world.base_pose()
-        roll, pitch, yaw = roll_pitch_yaw(quaternion)
-        angles = [roll, pitch, yaw + self._situation.orientation_error]
+        place, angles = np.array(position), np.array(roll_pitch_yaw(quaternion))
+        angles[2] += self._situation.orientation_error
         profile = self.profile
         if profile.position_noise or profile.orientation_noise:
             noise = self.np_random.standard_normal(6)
-            position = position + profile.position_noise * noise[:3]
-            angles = angles + profile.orientation_noise * noise[3:]
-        return list(position), list(angles)
+            place += profile.position_noise * noise[:3]
+            angles += profile.orientation_noise * noise[3:]
+        return place, angles
 
     def _settle(self) -> None:
         self.world.servo(self.rest_angles, np.full(len(self.joints), self.motor_torque))

@@ -33,10 +33,9 @@ def _body() -> Body:
     angles: dict[str, float] = {}
     for side, motor, sense in zip(_SIDES, motors, np.repeat(_LEG_SIDE, 2).tolist(), strict=True):
         angles |= {motor: sense * _REST, f"knee_{side}_link": -sense * _KNEE_AT_REST}
-    shanks = [f"lower_leg_{side}_link" for side in _SIDES]
-    loops = ((((right, _CLOSURE[0]), (left, _CLOSURE[1]))) for right, left in zip(shanks[::2], shanks[1::2], strict=True))
-    return Body("minitaur.urdf", motors, height=_START_HEIGHT, start_angles=angles, loops=tuple(loops))
-
+    ends = [(f"lower_leg_{side}_link", _CLOSURE[i % 2]) for i, side in enumerate(_SIDES)]
+    loops = tuple(zip(ends[::2], ends[1::2], strict=True))
+    return Body("minitaur.urdf", motors, height=_START_HEIGHT, start_angles=angles, loops=loops)
 
 
 HELD_OUT = Profile(

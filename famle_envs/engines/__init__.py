@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
-if TYPE_CHECKING:
-    from famle_envs.engines.world import World
+from famle_envs.engines.world import Body, Marker, Steps, World
 
 __all__ = ["ENGINES", "make_world", "resolve_engine"]
 
 ENGINES = ("pybullet", "mujoco")
 """The engines by the names of the packages that they need; the first one that is installed is the default."""
 
-_WORLDS = {"pybullet": ("bullet", "BulletWorld"), "mujoco": ("mujoco", "MujocoWorld")}
 _REMEDIES = {
-    "pybullet": '`pip install "famle[pybullet]"`; where PyBullet has no wheel, pip needs a compiler to build it. '
-    "Without the argument `engine`, the robot runs in an engine that is installed.",
+    "pybullet": '`pip install "famle[pybullet]"`, which needs a compiler where PyBullet has no wheel. '
+    "Without the argument `engine`, the robot runs in the engine that is installed.",
     "mujoco": "`pip install mujoco`.",
 }
 
@@ -37,22 +33,27 @@ def resolve_engine(name: str | None) -> str:
     return name
 
 
-def make_world(engine: str, *args: Any) -> World:
+def make_world(engine: str, body: Body, steps: Steps, marker: Marker | None) -> World:
     """Makes the world of a robot.
 
     Args:
         engine: One of :data:`ENGINES`.
-        *args: A :class:`~famle_envs.engines.world.Body`, its :class:`~famle_envs.engines.world.Steps` and a
-            :class:`~famle_envs.engines.world.Marker` or None.
+        body: The robot.
+        steps: How time passes.
+        marker: What pictures show beside the robot.
 
     Raises:
         gymnasium.error.DependencyNotInstalled: The engine is not installed.
     """
-    module, world = _WORLDS[engine]
     try:
-        made: World = getattr(import_module(f"famle_envs.engines.{module}"), world)(*args)
+        if engine == "pybullet":
+            from famle_envs.engines.bullet import BulletWorld
+
+            return BulletWorld(body, steps, marker)
+        from famle_envs.engines.mujoco import MujocoWorld
+
+        return MujocoWorld(body, steps, marker)
     except ModuleNotFoundError as error:
         if error.name != engine:
             raise
         raise gym.error.DependencyNotInstalled(f"{engine} is not installed: {_REMEDIES[engine]}") from error
-    return made

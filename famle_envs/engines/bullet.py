@@ -124,9 +124,7 @@ class BulletWorld:
             shape = pybullet.createVisualShape(pybullet.GEOM_CYLINDER, length=marker.height, **size)
         else:
             shape = pybullet.createVisualShape(pybullet.GEOM_SPHERE, **size)
-        pybullet.createMultiBody(
-            baseVisualShapeIndex=shape, basePosition=marker.position, physicsClientId=self.client
-        )
+        pybullet.createMultiBody(baseVisualShapeIndex=shape, basePosition=marker.position, physicsClientId=self.client)
 
     def _read_joint_limits(self) -> Array:
         info = [pybullet.getJointInfo(self.robot, joint, physicsClientId=self.client) for joint in self.joints]

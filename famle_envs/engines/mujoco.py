@@ -1,11 +1,12 @@
 """Robots in MuJoCo, from the same descriptions and under the same laws of motors and contacts as in PyBullet.
 
-A constraint there is an error that is to vanish within a step: a motor's or a contact's speed at once, a distance by
-:data:`_ERROR_REDUCTION` a step. MuJoCo's constraints are accelerations with a reference, so that this takes
+PyBullet's constraints let an error vanish: a motor's or a contact's speed v within a step, a distance r by a fifth a
+step. MuJoCo's pull towards a reference acceleration, so that this is
 
-    a_ref = -v / dt - erp r / dt^2,
+    a_ref = -v / dt - 0.2 r / dt^2,
 
-which its time constant 2 dt and damping ratio 1 / sqrt(4 erp) say.
+to which a time constant of 2 dt and a damping ratio of 1 / sqrt(0.8) amount. How rigid they are is left at MuJoCo's own
+0.9 to 0.95.
 """
 
 from __future__ import annotations
@@ -44,8 +45,6 @@ __all__ = ["MujocoWorld"]
 _ERROR_REDUCTION = 0.2  # PyBullet's
 _LINK_FRICTION = 0.5  # PyBullet's, of a link whose description has none
 _LINK_DAMPING = 0.1  # the same, of contacts (N s/m)
-_RIGIDITY = 0.999  # of constraints, where 1 would have no give at all
-_FRICTION_RIGIDITY = 100.0  # times that of the pressure, so that no foot creeps on a soft floor
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 _SEEN = 1  # the group of the shapes in a picture; those that collide are in group 0
 _FLOOR_COLOUR, _SKY_COLOUR = (0.75, 0.75, 0.78, 1.0), (0.92, 0.92, 0.95)
@@ -65,6 +64,8 @@ class MujocoWorld:
         self.data = mujoco.MjData(self.model)
         self._set_laws(steps)
         self._substeps = steps.substeps
+        # PyBullet lets a motor give in each substep the impulse that its torque has in a whole call.
+        self._torque_factor = steps.substeps
         self._base = int(self.model.body_rootid[-1])
         joints = np.array([self.model.joint(name).id for name in body.joints])
         self._angle_at, self._speed_at = self.model.jnt_qposadr[joints], self.model.jnt_dofadr[joints]
@@ -87,13 +88,10 @@ class MujocoWorld:
         option.timestep = steps.time_step / steps.substeps
         option.gravity[:] = (0.0, 0.0, -GRAVITY)
         option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        option.impratio = _FRICTION_RIGIDITY
         # Damping within the step would take from a motor what its constraint has given.
         option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
         law = (2.0 * option.timestep, 1.0 / math.sqrt(4.0 * _ERROR_REDUCTION))
-        for constraint in ("eq", "jnt", "geom", "dof"):
-            getattr(model, f"{constraint}_solref")[:] = law
-            getattr(model, f"{constraint}_solimp")[:, :2] = _RIGIDITY
+        model.eq_solref[:], model.jnt_solref[:], model.geom_solref[:] = law, law, law
 
     def set_start(self) -> None:
         mujoco.mj_getState(self.model, self.data, self._start, _STATE)
@@ -132,7 +130,7 @@ class MujocoWorld:
     def base_velocity(self) -> tuple[Point, Point]:
         turning = np.empty(3)
         mujoco.mju_rotVecQuat(turning, self.data.qvel[3:6], self.data.qpos[3:7])  # MuJoCo's is in the base's axes
-        vx, vy, vz, wx, wy, wz = (*self.data.qvel[:3].tolist(), *turning.tolist())
+        (vx, vy, vz), (wx, wy, wz) = self.data.qvel[:3].tolist(), turning.tolist()
         return (vx, vy, vz), (wx, wy, wz)
 
     def link_position(self, link: str) -> Point:
@@ -153,12 +151,12 @@ class MujocoWorld:
 
     def turn(self, speeds: Array, torque: float) -> None:
         self._speeds[:], self._gains[:] = speeds, 0.0
-        self.model.dof_frictionloss[self._speed_at] = torque
+        self.model.dof_frictionloss[self._speed_at] = self._torque_factor * torque
         self._find_driven()
 
     def servo(self, angles: Array, torques: Array, gain: float = DEFAULT_GAIN) -> None:
         self._speeds[:], self._gains[:], self._targets[:] = 0.0, gain, angles
-        self.model.dof_frictionloss[self._speed_at] = torques
+        self.model.dof_frictionloss[self._speed_at] = self._torque_factor * torques
         self._find_driven()
 
     def hold(self, angles: Mapping[int, float]) -> None:
@@ -237,20 +235,20 @@ class _Contacts:
         self._geoms = np.flatnonzero(model.geom_contype)
         self._links = model.geom_bodyid[self._geoms]
         names = [model.body(link).name for link in self._links]
-        said = {link.get("name"): link.find("contact") for link in description.iter("link")}
+        said = {link.get("name"): link for link in description.iter("link")}
 
         def values(name: str, default: float) -> Array:
-            elements = [None if said[link] is None else said[link].find(name) for link in names]
-            return np.array([default if element is None else float(element.get("value", 0)) for element in elements])
+            elements = [said[link].find(f"contact/{name}") for link in names]
+            return np.array([default if element is None else float(element.attrib["value"]) for element in elements])
 
         self._friction = values("lateral_friction", _LINK_FRICTION)
         self._stiffness, self._damping = values("stiffness", math.inf), values("damping", _LINK_DAMPING)
-        self._rigid_law = model.geom_solref[0].copy() if model.ngeom else None
+        self._rigid = model.geom_solref[self._geoms].copy(), model.geom_solimp[self._geoms].copy()
 
     def apply(self, model: Any, friction: float, stiffness: float, damping: float) -> None:
         """Combines the floor's with each link's: frictions multiply, springs are in series, dampings add up."""
         model.geom_friction[self._geoms, 0] = friction * self._friction
-        model.geom_solref[self._geoms], model.geom_solimp[self._geoms, :2] = self._rigid_law, _RIGIDITY
+        model.geom_solref[self._geoms], model.geom_solimp[self._geoms] = self._rigid
         spring = 1.0 / (1.0 / self._stiffness + (1.0 / stiffness if stiffness else 0.0) + 1e-18)
         soft = spring < 1e17
         dt, spring = model.opt.timestep, spring[soft]
