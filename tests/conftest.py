@@ -15,6 +15,7 @@ import famle_envs  # noqa: F401 (registers the robots)
 from benchmarks import ppo
 from famle_agent import FAMLE, Transitions
 from famle_agent.agents.presets import known_robots
+from famle_envs.engines import ENGINES
 from tests.small_reacher import EPISODE, REDUCED, SMALL_ROLLOUTS
 
 mpl.use("Agg")
@@ -86,6 +87,13 @@ def agent(load_agent: Callable[..., FAMLE]) -> FAMLE:
 def quick_agent(load_agent: Callable[..., FAMLE]) -> FAMLE:
     """A fresh copy of the small agent that plans and adapts in little time, and not well."""
     return load_agent(**QUICK)
+
+
+@pytest.fixture(params=ENGINES)
+def engine(request: pytest.FixtureRequest) -> str:
+    """The name of each engine that is installed."""
+    pytest.importorskip(request.param)
+    return str(request.param)
 
 
 @pytest.fixture

@@ -11,7 +11,6 @@ from unittest.mock import patch
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-import pybullet
 import torch
 from hypothesis import strategies as st
 from torch import Tensor
@@ -52,12 +51,12 @@ def run(agent: FAMLE, env: gym.Env[Any, Any], steps: int, seed: int = 0) -> Onli
 
 
 @contextmanager
-def making(robot: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
-    """Makes robots, already reset, and closes them in the end."""
+def making(robot: Callable[..., Any], engine: str | None = None) -> Iterator[Callable[..., Any]]:
+    """Makes robots in an engine, already reset, and closes them in the end."""
     made: list[Any] = []
 
     def make(*args: Any, **kwargs: Any) -> Any:
-        made.append(robot(*args, **kwargs))
+        made.append(robot(*args, **{"engine": engine, **kwargs}))
         made[-1].reset(seed=0)
         return made[-1]
 
@@ -66,9 +65,10 @@ def making(robot: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
         env.close()
 
 
-def quadruped_with(situation: Any = None, **ingredients: Any) -> QuadrupedEnv:
+def quadruped_with(situation: Any = None, *, engine: str | None = None, **ingredients: Any) -> QuadrupedEnv:
     """A quadruped with a profile of some ingredients."""
-    return QuadrupedEnv(situation=situation, profile=Profile("test", **ingredients) if ingredients else "simulator")
+    profile = Profile("test", **ingredients) if ingredients else "simulator"
+    return QuadrupedEnv(situation=situation, profile=profile, engine=engine)
 
 
 def walk(env: GaitEnv, action: Any, gaits: int = 1) -> Array:
@@ -78,43 +78,15 @@ def walk(env: GaitEnv, action: Any, gaits: int = 1) -> Array:
 
 def watch(env: GaitEnv, action: Any, read: Callable[[GaitEnv], Any]) -> Array:
     """What ``read`` sees of the robot after each call of the simulator in one gait."""
-    rows, simulate = [], pybullet.stepSimulation
+    rows, simulate = [], env.world.simulate
 
-    def simulate_and_read(**kwargs: Any) -> None:
-        simulate(**kwargs)
+    def simulate_and_read() -> None:
+        simulate()
         rows.append(read(env))
 
-    with patch.object(pybullet, "stepSimulation", simulate_and_read):
+    with patch.object(env.world, "simulate", simulate_and_read):
         env.step(np.asarray(action, np.float64))
     return np.array(rows)
-
-
-def joint_angles(env: GaitEnv) -> list[float]:
-    return [state[0] for state in pybullet.getJointStates(env.robot, env.joints, physicsClientId=env.client)]
-
-
-def joint_speeds(env: GaitEnv) -> list[float]:
-    return [state[1] for state in pybullet.getJointStates(env.robot, env.joints, physicsClientId=env.client)]
-
-
-def masses(env: GaitEnv) -> Array:
-    """Of the base and of each link, in kg."""
-    return np.array([info[0] for info in _dynamics(env)])
-
-
-def inertias(env: GaitEnv) -> Array:
-    """Of the base and of each link about its axes, (n, 3), in kg m^2."""
-    return np.array([info[2] for info in _dynamics(env)])
-
-
-def _dynamics(env: GaitEnv) -> list[tuple[Any, ...]]:
-    links = range(-1, pybullet.getNumJoints(env.robot, physicsClientId=env.client))
-    return [pybullet.getDynamicsInfo(env.robot, link, physicsClientId=env.client) for link in links]
-
-
-def put(env: GaitEnv, place: tuple[float, float, float], quaternion: Any = (0.0, 0.0, 0.0, 1.0)) -> None:
-    """Moves the robot as a whole; x, y, z, w of the quaternion."""
-    pybullet.resetBasePositionAndOrientation(env.robot, place, quaternion, physicsClientId=env.client)
 
 
 # --- models -------------------------------------------------------------------------------------------------

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pybullet
 import pytest
 import torch
 from hypothesis import given
@@ -16,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from famle_envs.ant import AntEnv
 from tests.helpers import making
+from tests.worlds import LEVEL, momenta, place_of, push, put, without_gravity
 
 Array = npt.NDArray[Any]
 Make = Callable[..., AntEnv]
@@ -29,12 +29,11 @@ SPEEDS = slice(19, 27)
 REST = np.zeros(8)
 PERIOD = 1 / 60.6
 MEAN_ANGLES = np.array([0.0, math.pi / 4] * 4)
-LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
 @pytest.fixture
-def make() -> Iterator[Make]:
-    with making(AntEnv) as make_robot:
+def make(engine: str) -> Iterator[Make]:
+    with making(AntEnv, engine) as make_robot:
         yield make_robot
 
 
@@ -55,43 +54,18 @@ def settle(env: AntEnv) -> Array:
     return follow(env, np.zeros((120, 8)))[-1]
 
 
-def place_of(env: AntEnv) -> Array:
-    return np.array(pybullet.getBasePositionAndOrientation(env.robot, physicsClientId=env.client)[0])
-
-
-def put(env: AntEnv, place: tuple[float, float, float], quaternion: tuple[float, ...] = LEVEL) -> None:
-    pybullet.resetBasePositionAndOrientation(env.robot, place, quaternion, physicsClientId=env.client)
-
-
-def push(env: AntEnv, speed: float) -> None:
-    pybullet.resetBaseVelocity(env.robot, (speed, 0, 0), (0, 0, 0), physicsClientId=env.client)
-
-
-def momenta(env: AntEnv) -> Array:
-    """Of the torso and of each link, (9, 3)."""
-    robot, client = env.robot, env.client
-    velocities = [pybullet.getBaseVelocity(robot, physicsClientId=client)[0]]
-    masses = [pybullet.getDynamicsInfo(robot, -1, physicsClientId=client)[0]]
-    for link in JOINTS:
-        state = pybullet.getLinkState(robot, link, computeLinkVelocity=True, physicsClientId=client)
-        velocities.append(state[6])
-        masses.append(pybullet.getDynamicsInfo(robot, link, physicsClientId=client)[0])
-    return np.array(masses)[:, None] * np.array(velocities)
-
-
 # --- Observations ---
 
 
 def test_observation_is_the_state_of_the_simulator_in_the_documented_order(make: Make) -> None:
     env = make()
-    robot, client = env.robot, env.client
     for action in commands(40):
         obs = env.step(action)[0]
-        place, quaternion = pybullet.getBasePositionAndOrientation(robot, physicsClientId=client)
-        velocity, angular = pybullet.getBaseVelocity(robot, physicsClientId=client)
-        joints = np.array([pybullet.getJointState(robot, j, physicsClientId=client)[:2] for j in JOINTS])
+        place, quaternion = env.world.base_pose()
+        velocity, angular = env.world.base_velocity()
+        angles, speeds = env.world.joint_states()
         upwards = np.array(quaternion) * (1.0 if quaternion[3] >= 0 else -1.0)
-        expected = np.concatenate([place[2:], upwards, joints[:, 0], velocity, angular, joints[:, 1]])
+        expected = np.concatenate([place[2:], upwards, angles, velocity, angular, speeds])
         assert obs.shape == (27,)
         assert obs.dtype == np.float32
         np.testing.assert_allclose(obs, expected, rtol=1e-6, atol=1e-7)
@@ -112,7 +86,7 @@ def test_velocities_are_those_at_which_the_measured_positions_change(make: Make)
 
 def test_legs_are_front_left_back_left_back_right_and_front_right(make: Make) -> None:
     env = make()
-    feet = [pybullet.getLinkState(env.robot, joint, physicsClientId=env.client)[0] for joint in (1, 3, 5, 7)]
+    feet = [env.world.link_position(joint.replace("ankle", "foot")) for joint in env.joints[1::2]]
     np.testing.assert_array_equal(np.sign(feet)[:, :2], [[1, 1], [-1, 1], [-1, -1], [1, -1]])
 
 
@@ -136,7 +110,7 @@ def test_ant_without_torque_comes_to_rest_above_the_height_of_a_fall(make: Make)
 def test_torques_within_the_robot_move_it_as_a_whole_hardly(make: Make) -> None:
     env = make()
     put(env, (0, 0, 5))
-    pybullet.setGravity(0, 0, 0, physicsClientId=env.client)
+    without_gravity(env)
     totals, exchanged = [], []
     for action in 0.3 * np.sign(commands()):
         env.step(action)

@@ -9,7 +9,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-import pybullet
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env as check_with_gymnasium
@@ -19,7 +18,8 @@ from stable_baselines3.common.env_checker import check_env as check_with_sb3
 from famle_envs import Situation
 from famle_envs.gait_env import GaitEnv
 from famle_envs.minitaur import MinitaurEnv
-from tests.helpers import joint_angles, making, masses, put, walk, watch
+from tests.helpers import making, walk, watch
+from tests.worlds import joint_angles, masses, point_of, put
 
 Array = npt.NDArray[Any]
 Make = Callable[..., MinitaurEnv]
@@ -33,8 +33,8 @@ CLOSURE = ((0.0, 0.005, 0.2), (0.0, 0.01, 0.2))
 
 
 @pytest.fixture
-def make() -> Iterator[Make]:
-    with making(MinitaurEnv) as make_robot:
+def make(engine: str) -> Iterator[Make]:
+    with making(MinitaurEnv, engine) as make_robot:
         yield make_robot
 
 
@@ -51,8 +51,8 @@ def shank_ends(env: GaitEnv) -> Array:
     ends = []
     for motors in np.reshape(env.joints, (4, 2)).tolist():
         for motor, end in zip(motors, CLOSURE, strict=True):
-            state = pybullet.getLinkState(env.robot, motor + 2, physicsClientId=env.client)
-            ends.append(pybullet.multiplyTransforms(*state[:2], end, (0, 0, 0, 1))[0])
+            shank = motor.replace("motor", "lower_leg").replace("joint", "link")
+            ends.append(point_of(env, shank, end))
     return np.reshape(ends, (4, 2, 3))
 
 
@@ -112,7 +112,7 @@ def test_observation_is_the_place_and_the_orientation_of_the_body(make: Make) ->
         obs, *_ = env.step(action)
         assert obs in env.observation_space
         np.testing.assert_allclose(obs[:3], env.position, rtol=1e-6)
-        quaternion = pybullet.getBasePositionAndOrientation(env.robot, physicsClientId=env.client)[1]
+        quaternion = env.world.base_pose()[1]
         missed = Rotation.from_euler("xyz", obs[3:]).inv() * Rotation.from_quat(quaternion)
         assert missed.magnitude() == pytest.approx(0.0, abs=1e-5)
 

@@ -15,7 +15,8 @@ from famle_envs.gait_env import GaitEnv
 from famle_envs.minitaur import MinitaurEnv
 from famle_envs.profile import SIMULATOR, Profile, resolve_profile
 from famle_envs.quadruped import QuadrupedEnv
-from tests.helpers import inertias, making, masses, quadruped_with, walk
+from tests.helpers import making, quadruped_with, walk
+from tests.worlds import inertias, masses
 
 Make = Callable[..., QuadrupedEnv]
 
@@ -24,8 +25,8 @@ ROBOTS: list[type[GaitEnv]] = [QuadrupedEnv, MinitaurEnv]
 
 
 @pytest.fixture
-def make() -> Iterator[Make]:
-    with making(quadruped_with) as make_robot:
+def make(engine: str) -> Iterator[Make]:
+    with making(quadruped_with, engine) as make_robot:
         yield make_robot
 
 

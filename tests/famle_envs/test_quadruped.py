@@ -14,7 +14,8 @@ from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
 from famle_envs import Situation
 from famle_envs.quadruped import LEGS, QuadrupedEnv, blocked_leg
-from tests.helpers import joint_angles, making, masses, walk, watch
+from tests.helpers import making, walk, watch
+from tests.worlds import joint_angles, masses
 
 Array = npt.NDArray[Any]
 Make = Callable[..., QuadrupedEnv]
@@ -28,8 +29,8 @@ ALL_JOINTS = np.array([0.3, 0.7, 1.0, 0.0])
 
 
 @pytest.fixture
-def make() -> Iterator[Make]:
-    with making(QuadrupedEnv) as make_robot:
+def make(engine: str) -> Iterator[Make]:
+    with making(QuadrupedEnv, engine) as make_robot:
         yield make_robot
 
 

@@ -13,7 +13,8 @@ from gymnasium.envs.registration import EnvSpec
 
 from famle_envs.profile import Profile
 from famle_envs.quadruped import QuadrupedEnv
-from tests.helpers import making, put, walk
+from tests.helpers import making, walk
+from tests.worlds import put
 
 Array = npt.NDArray[Any]
 Make = Callable[..., QuadrupedEnv]
@@ -22,8 +23,8 @@ STAND, FORWARDS = np.array([0.0, 0.0, -1.0, 0.0]), np.array([0.0, 1.0, 0.0, 0.0]
 
 
 @pytest.fixture
-def make() -> Iterator[Make]:
-    with making(QuadrupedEnv) as make_robot:
+def make(engine: str) -> Iterator[Make]:
+    with making(QuadrupedEnv, engine) as make_robot:
         yield make_robot
 
 

@@ -20,8 +20,8 @@ Make = Callable[..., ReacherEnv]
 
 
 @pytest.fixture
-def make() -> Iterator[Make]:
-    with making(ReacherEnv) as make_robot:
+def make(engine: str) -> Iterator[Make]:
+    with making(ReacherEnv, engine) as make_robot:
         yield make_robot
 
 

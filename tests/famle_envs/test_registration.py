@@ -19,13 +19,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from famle_envs import Situation
 from famle_envs.ant import AntEnv
-from famle_envs.bullet_env import BulletEnv
 from famle_envs.reacher import ReacherEnv
+from famle_envs.robot_env import RobotEnv
 
 MakeEnv = Callable[..., gym.Env[Any, Any]]
 
 REACHER, ANT = "FamleReacher-v0", "FamleAnt-v0"
-CLASSES: dict[str, type[BulletEnv]] = {REACHER: ReacherEnv, ANT: AntEnv}
+CLASSES: dict[str, type[RobotEnv]] = {REACHER: ReacherEnv, ANT: AntEnv}
 BROKEN = Situation(motor_gain=(-1, 1, 1, 0))
 DESCRIPTION = "joint 0 reversed, joint 3 dead"
 CHECKED = [

@@ -4,13 +4,13 @@ import math
 from collections.abc import Callable, Iterator
 
 import numpy as np
-import pybullet
 import pytest
 
 from famle_envs.gait_env import GaitEnv
 from famle_envs.gaits import trot
 from famle_envs.quadruped import QuadrupedEnv
-from tests.helpers import joint_angles, joint_speeds, making, put, quadruped_with, walk, watch
+from tests.helpers import making, quadruped_with, walk, watch
+from tests.worlds import joint_angles, joint_speeds, put, turn_joint, without_gravity
 
 Make = Callable[..., QuadrupedEnv]
 
@@ -19,8 +19,8 @@ HIP = 0
 
 
 @pytest.fixture
-def make() -> Iterator[Make]:
-    with making(quadruped_with) as make_robot:
+def make(engine: str) -> Iterator[Make]:
+    with making(quadruped_with, engine) as make_robot:
         yield make_robot
 
 
@@ -104,13 +104,11 @@ def test_blocked_joint_is_held_by_more_than_its_motor(make: Make) -> None:
 
 def decay(env: GaitEnv) -> float:
     """How fast a hip without a motor loses its speed in weightlessness, in 1/s."""
-    world = {"physicsClientId": env.client}
-    pybullet.setGravity(0.0, 0.0, 0.0, **world)
+    without_gravity(env)
     put(env, (0.0, 0.0, 5.0))
-    for joint in env.joints:
-        pybullet.setJointMotorControl2(env.robot, joint, pybullet.VELOCITY_CONTROL, force=0.0, **world)
-    pybullet.resetJointState(env.robot, HIP, 0.0, 2.0, **world)
-    pybullet.stepSimulation(**world)
+    env.world.release()
+    turn_joint(env, HIP, 2.0)
+    env.world.simulate()
     return math.log(2.0 / joint_speeds(env)[HIP]) / env.time_step
 
 

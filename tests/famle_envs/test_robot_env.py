@@ -15,15 +15,16 @@ import torch
 
 from famle_envs import Situation
 from famle_envs.ant import AntEnv
-from famle_envs.bullet_env import BulletEnv
 from famle_envs.reacher import ReacherEnv
+from famle_envs.robot_env import RobotEnv
+from tests.helpers import making
 
 Array = npt.NDArray[Any]
-Make = Callable[..., BulletEnv]
+Make = Callable[..., RobotEnv]
 MakeEnv = Callable[..., gym.Env[Any, Any]]
 
 REACHER, ANT = "FamleReacher-v0", "FamleAnt-v0"
-CLASSES: dict[str, type[BulletEnv]] = {REACHER: ReacherEnv, ANT: AntEnv}
+CLASSES: dict[str, type[RobotEnv]] = {REACHER: ReacherEnv, ANT: AntEnv}
 BROKEN = Situation(motor_gain=(-1, 1, 1, 0))
 DESCRIPTION = "joint 0 reversed, joint 3 dead"
 
@@ -34,30 +35,22 @@ def env_id(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture
-def make(env_id: str) -> Iterator[Make]:
+def make(env_id: str, engine: str) -> Iterator[Make]:
     """Makes bare environments, already reset, and closes them in the end."""
-    made: list[BulletEnv] = []
-
-    def make_env(**kwargs: Any) -> BulletEnv:
-        made.append(CLASSES[env_id](**kwargs))
-        made[-1].reset(seed=0)
-        return made[-1]
-
-    yield make_env
-    for env in made:
-        env.close()
+    with making(CLASSES[env_id], engine) as make_robot:
+        yield make_robot
 
 
-def commands(env: BulletEnv, seed: int = 0, steps: int = 40) -> Array:
+def commands(env: RobotEnv, seed: int = 0, steps: int = 40) -> Array:
     return np.random.default_rng(seed).uniform(-1, 1, (steps, len(env.joints)))
 
 
-def follow(env: BulletEnv, actions: Array) -> Array:
+def follow(env: RobotEnv, actions: Array) -> Array:
     """All observations after the actions, each with its reward."""
     return np.stack([np.append(*env.step(action)[:2]) for action in actions])
 
 
-def episode(env: BulletEnv, seed: int = 0) -> Array:
+def episode(env: RobotEnv, seed: int = 0) -> Array:
     """The start and what random actions make of it, each with its reward."""
     start = np.append(env.reset(seed=seed)[0], 0.0)
     return np.vstack([start, follow(env, commands(env, seed))])
@@ -299,12 +292,12 @@ def test_closed_environment_closes_again_but_does_nothing_else(make: Make) -> No
             use()
 
 
-def pickled(env: BulletEnv) -> BulletEnv:
+def pickled(env: RobotEnv) -> RobotEnv:
     return pickle.loads(pickle.dumps(env))  # type: ignore[no-any-return]  # noqa: S301 (our own)
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, pickled])
-def test_copy_has_a_world_of_its_own(make: Make, copied: Callable[[BulletEnv], BulletEnv]) -> None:
+def test_copy_has_a_world_of_its_own(make: Make, copied: Callable[[RobotEnv], RobotEnv]) -> None:
     env, twin = make(situation=BROKEN), make(situation=BROKEN)
     action = np.full(env.action_space.shape, 0.5)
     copy_of_it = copied(env)
