@@ -12,8 +12,8 @@ import os
 import platform
 import subprocess
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from importlib.metadata import version
+from contextlib import contextmanager, suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,9 @@ _TEXT = {
 }
 """Columns of text. A setting's name such as 12345678 is no number."""
 
-_PACKAGES = ("famle", "gymnasium", "matplotlib", "numpy", "pybullet", "scipy", "stable-baselines3", "torch")
+_PACKAGES = (
+    *("famle", "gymnasium", "matplotlib", "mujoco", "numpy", "pybullet", "scipy", "stable-baselines3", "torch"),
+)
 
 
 def load(path: Path) -> pd.DataFrame:
@@ -78,8 +80,15 @@ def provenance(argv: Sequence[str]) -> Result:
     return {
         "command": " ".join(_command(argv)),
         "commit": _commit(),
-        "versions": {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES},
+        "versions": {"python": platform.python_version()} | dict(_versions()),
     }
+
+
+def _versions() -> Iterator[tuple[str, str]]:
+    """Of the packages that are installed; PyBullet need not be."""
+    for name in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            yield name, version(name)
 
 
 def _read(path: Path) -> pd.DataFrame:

@@ -21,7 +21,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pandas as pd
-import pybullet
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -102,13 +101,12 @@ def in_turns(robot: str, args: Args) -> dict[str, list[float]]:
 
 
 def environment(robot: str, args: Args) -> dict[str, float]:
-    """Times a step of the environment against its bare ``stepSimulation`` calls."""
+    """Times a step of the environment against the bare calls of its simulator."""
     env: Any = _make(robot).unwrapped
     action = np.full(env.action_space.shape, 0.3)
 
     def bare() -> None:
-        for _ in range(env.physics_steps):
-            pybullet.stepSimulation(physicsClientId=env.client)
+        env.world.simulate(env.physics_steps)
 
     step, raw = _medians(10 * args.repeats, lambda: env.step(action), bare)
     env.close()

@@ -292,7 +292,7 @@ def _tasks(env: VecEnv) -> list[str]:
     return [json.dumps(kwargs, default=repr, sort_keys=True) for kwargs in asked]
 
 
-_NO_TASK = frozenset({"situation", "profile", "render_mode"})
+_NO_TASK = frozenset({"situation", "profile", "engine", "render_mode"})
 
 
 def _get(env: gym.Env[Any, Any], name: str, default: Any) -> Any:

@@ -43,11 +43,13 @@ from famle_envs.engines.world import (
 __all__ = ["MujocoWorld"]
 
 _ERROR_REDUCTION = 0.2  # PyBullet's
+_MOTOR_RIGIDITY, _LOCK_RIGIDITY = 0.95, 0.999  # of constraints, where 1 would have no give at all
+_FRICTION_RIGIDITY = 10.0  # times that of the pressure; with MuJoCo's own 1, feet creep
 _LINK_FRICTION = 0.5  # PyBullet's, of a link whose description has none
 _LINK_DAMPING = 0.1  # the same, of contacts (N s/m)
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 _SEEN = 1  # the group of the shapes in a picture; those that collide are in group 0
-_FLOOR_COLOUR, _SKY_COLOUR = (0.75, 0.75, 0.78, 1.0), (0.92, 0.92, 0.95)
+_FLOOR_COLOURS, _SKY_COLOUR = ((0.93, 0.93, 0.93), (0.63, 0.72, 0.93)), (1.0, 1.0, 1.0)
 
 
 class MujocoWorld:
@@ -64,15 +66,13 @@ class MujocoWorld:
         self.data = mujoco.MjData(self.model)
         self._set_laws(steps)
         self._substeps = steps.substeps
-        # PyBullet lets a motor give in each substep the impulse that its torque has in a whole call.
-        self._torque_factor = steps.substeps
         self._base = int(self.model.body_rootid[-1])
         joints = np.array([self.model.joint(name).id for name in body.joints])
         self._angle_at, self._speed_at = self.model.jnt_qposadr[joints], self.model.jnt_dofadr[joints]
         self._link_of_joint = self.model.jnt_bodyid[joints]
         limits = np.where(self.model.jnt_limited[joints] != 0, self.model.jnt_range[joints].T, [[-np.inf], [np.inf]])
         self.joint_limits: Array = limits
-        self._targets, self._gains, self._speeds = np.zeros((3, len(joints)))
+        self._targets, self._gains, self._speeds, self._bounds = np.zeros((4, len(joints)))
         self._driven = np.empty(0, dtype=np.intp)
         names = ("body_mass", "body_inertia", "dof_damping", "geom_rgba")
         self._as_built = {name: getattr(self.model, name).copy() for name in names}
@@ -92,6 +92,7 @@ class MujocoWorld:
         option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
         law = (2.0 * option.timestep, 1.0 / math.sqrt(4.0 * _ERROR_REDUCTION))
         model.eq_solref[:], model.jnt_solref[:], model.geom_solref[:] = law, law, law
+        option.impratio = _FRICTION_RIGIDITY
 
     def set_start(self) -> None:
         mujoco.mj_getState(self.model, self.data, self._start, _STATE)
@@ -143,32 +144,35 @@ class MujocoWorld:
         self.data.qvel[self._speed_at] = 0.0
 
     def release(self) -> None:
-        self.model.dof_frictionloss[self._speed_at] = 0.0
-        self._find_driven()
+        self._set_bounds(np.zeros(len(self._speed_at)))
 
     def apply_torques(self, torques: Array) -> None:
         self.data.qfrc_applied[self._speed_at] = torques
 
     def turn(self, speeds: Array, torque: float) -> None:
         self._speeds[:], self._gains[:] = speeds, 0.0
-        self.model.dof_frictionloss[self._speed_at] = self._torque_factor * torque
-        self._find_driven()
+        self._set_bounds(np.full(len(speeds), torque))
 
     def servo(self, angles: Array, torques: Array, gain: float = DEFAULT_GAIN) -> None:
         self._speeds[:], self._gains[:], self._targets[:] = 0.0, gain, angles
-        self.model.dof_frictionloss[self._speed_at] = self._torque_factor * torques
-        self._find_driven()
+        self._set_bounds(torques)
 
     def hold(self, angles: Mapping[int, float]) -> None:
-        joints = list(angles)
+        joints, bounds = list(angles), self._bounds.copy()
         self._speeds[joints], self._gains[joints], self._targets[joints] = 0.0, DEFAULT_GAIN, list(angles.values())
-        self.model.dof_frictionloss[self._speed_at[joints]] = HOLDING_TORQUE
-        self._find_driven()
+        bounds[joints] = HOLDING_TORQUE
+        self._set_bounds(bounds)
 
-    def _find_driven(self) -> None:
-        """Finds the motors with any torque, in the order of the model's frictions."""
-        order = np.argsort(self._speed_at)
-        self._driven = order[self.model.dof_frictionloss[self._speed_at[order]] > 0.0]
+    def _set_bounds(self, torques: Array) -> None:
+        if (torques == self._bounds).all():
+            return
+        self._bounds = torques
+        # PyBullet lets a motor give in each substep the impulse that its torque has in a whole call.
+        self.model.dof_frictionloss[self._speed_at] = self._substeps * torques
+        rigidity = np.where(torques < HOLDING_TORQUE, _MOTOR_RIGIDITY, _LOCK_RIGIDITY)
+        self.model.dof_solimp[self._speed_at, :2] = rigidity[:, None]
+        order = np.argsort(self._speed_at)  # of the model's frictions
+        self._driven = order[torques[order] > 0.0]
 
     def set_floor(self, friction: float, stiffness: float = 0.0, damping: float = 0.0) -> None:
         self._floor = friction, stiffness, damping
@@ -210,8 +214,8 @@ def _compile(description: ElementTree.Element, body: Body, marker: Marker | None
     for geom in spec.geoms:
         geom.contype, geom.conaffinity, geom.priority = int(geom.group != _SEEN), 0, 1
     if not body.fixed:
-        floor = {**seen, "conaffinity": 1}
-        world.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 1.0), rgba=_FLOOR_COLOUR, **floor)
+        floor = {**seen, "conaffinity": 1, "material": "floor"}
+        world.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 1.0), **floor)
     for ends in body.loops:
         sites = [spec.body(link).add_site(name=f"{link} end", pos=point).name for link, point in ends]
         spec.add_equality(
@@ -221,11 +225,25 @@ def _compile(description: ElementTree.Element, body: Body, marker: Marker | None
         kind = mujoco.mjtGeom.mjGEOM_CYLINDER if marker.height else mujoco.mjtGeom.mjGEOM_SPHERE
         size = (marker.radius, 0.5 * marker.height, 0.0)
         world.add_geom(type=kind, size=size, pos=marker.position, rgba=MARKER_COLOUR, **seen)
-    sky = {"type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mujoco.mjtBuiltin.mjBUILTIN_FLAT}
-    spec.add_texture(name="sky", rgb1=_SKY_COLOUR, rgb2=_SKY_COLOUR, width=8, height=8, **sky)
-    spec.visual.global_.fovy = FIELD_OF_VIEW
-    spec.visual.global_.offwidth = spec.visual.global_.offheight = PICTURE_SIZE
+    _light(spec)
     return spec.compile()
+
+
+def _light(spec: Any) -> None:
+    """Gives a model its floor's material, its sky and its light."""
+    one, other = _FLOOR_COLOURS
+    texture, builtin = mujoco.mjtTexture, mujoco.mjtBuiltin
+    size = {"width": 64, "height": 64}
+    spec.add_texture(
+        name="tiles", type=texture.mjTEXTURE_2D, builtin=builtin.mjBUILTIN_CHECKER, rgb1=one, rgb2=other, **size
+    )
+    sky = {"rgb1": _SKY_COLOUR, "rgb2": _SKY_COLOUR, **size}
+    spec.add_texture(name="sky", type=texture.mjTEXTURE_SKYBOX, builtin=builtin.mjBUILTIN_FLAT, **sky)
+    floor = spec.add_material(name="floor", texrepeat=(0.5, 0.5), texuniform=True, specular=0.0)
+    floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
+    light, whole = spec.visual.headlight, spec.visual.global_
+    light.ambient, light.diffuse, light.specular = (0.5,) * 3, (0.5,) * 3, (0.0,) * 3
+    whole.fovy, whole.offwidth, whole.offheight = FIELD_OF_VIEW, PICTURE_SIZE, PICTURE_SIZE
 
 
 class _Contacts:
