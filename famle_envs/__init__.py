@@ -1,6 +1,7 @@
 """Simulated robots that can break: Gymnasium environments with a ``situation``.
 
-Importing the package registers ``FamleReacher-v0``, ``FamleAnt-v0``, ``FamleQuadruped-v0`` and ``FamleMinitaur-v0``.
+Importing the package registers ``FamleReacher-v0``, ``FamleAnt-v0``, ``FamleQuadruped-v0`` and ``FamleMinitaur-v0``,
+each in PyBullet where that is installed and in MuJoCo elsewhere, or as the argument ``engine`` says.
 """
 
 import gymnasium as gym

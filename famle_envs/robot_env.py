@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -213,8 +214,8 @@ class RobotEnv(gym.Env[Array, Array]):
             self._load()
 
     def __del__(self) -> None:
-        # A world that nobody closes would keep its memory until the process ends.
-        if getattr(self, "_world", None) is not None:
+        # A world that nobody closes would keep its memory until the process ends, when what it lives in may be gone.
+        if getattr(self, "_world", None) is not None and not sys.is_finalizing():
             self.close()
 
     @property

@@ -16,6 +16,7 @@ from benchmarks import ppo
 from famle_agent import FAMLE, Transitions
 from famle_agent.agents.presets import known_robots
 from famle_envs.engines import ENGINES
+from tests.helpers import skip_what_cannot_be_drawn
 from tests.small_reacher import EPISODE, REDUCED, SMALL_ROLLOUTS
 
 mpl.use("Agg")
@@ -102,6 +103,7 @@ def make_env() -> Iterator[Callable[..., gym.Env[Any, Any]]]:
     envs = []
 
     def make(env_id: str = "FamleReacher-v0", **kwargs: Any) -> gym.Env[Any, Any]:
+        skip_what_cannot_be_drawn(kwargs.get("engine"), kwargs.get("render_mode"))
         envs.append(gym.make(env_id, **kwargs))
         return envs[-1]
 

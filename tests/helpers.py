@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
+from functools import cache
 from typing import Any
 from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
+import pytest
 import torch
 from hypothesis import strategies as st
 from torch import Tensor
@@ -22,9 +24,11 @@ from famle_agent.adaptation.memory import Memory
 from famle_agent.models.dynamics import Dynamics, Theta
 from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.models.observation import DIMS, ObservationLayout
+from famle_envs.engines import resolve_engine
 from famle_envs.gait_env import GaitEnv
 from famle_envs.profile import Profile
 from famle_envs.quadruped import QuadrupedEnv
+from famle_envs.reacher import ReacherEnv
 
 Array = npt.NDArray[Any]
 
@@ -50,12 +54,31 @@ def run(agent: FAMLE, env: gym.Env[Any, Any], steps: int, seed: int = 0) -> Onli
 # --- robots that walk a gait a second -----------------------------------------------------------------------
 
 
+@cache
+def draws(engine: str) -> bool:
+    """Whether an engine can render here; MuJoCo needs OpenGL."""
+    with closing(ReacherEnv(engine=engine, render_mode="rgb_array")) as env:
+        env.reset(seed=0)
+        try:
+            env.render()
+        except RuntimeError:
+            return False
+    return True
+
+
+def skip_what_cannot_be_drawn(engine: str | None, render_mode: str | None) -> None:
+    """Skips the test where the engine, by its name, cannot render here."""
+    if render_mode is not None and not draws(resolve_engine(engine)):
+        pytest.skip("no OpenGL to render with")
+
+
 @contextmanager
 def making(robot: Callable[..., Any], engine: str | None = None) -> Iterator[Callable[..., Any]]:
     """Makes robots in an engine, already reset, and closes them in the end."""
     made: list[Any] = []
 
     def make(*args: Any, **kwargs: Any) -> Any:
+        skip_what_cannot_be_drawn(engine, kwargs.get("render_mode"))
         made.append(robot(*args, **{"engine": engine, **kwargs}))
         made[-1].reset(seed=0)
         return made[-1]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from importlib.resources import as_file, files
 from typing import Any
 
@@ -143,8 +142,7 @@ class BulletWorld:
             pybullet.stepSimulation(physicsClientId=self.client)
 
     def close(self) -> None:
-        with suppress(pybullet.error):  # at the interpreter's end the server may be gone already
-            pybullet.disconnect(physicsClientId=self.client)
+        pybullet.disconnect(physicsClientId=self.client)
 
     def joint_states(self) -> tuple[Array, Array]:
         states = pybullet.getJointStates(self.robot, self.joints, physicsClientId=self.client)

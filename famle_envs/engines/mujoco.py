@@ -72,13 +72,14 @@ class MujocoWorld:
         self._link_of_joint = self.model.jnt_bodyid[joints]
         limits = np.where(self.model.jnt_limited[joints] != 0, self.model.jnt_range[joints].T, [[-np.inf], [np.inf]])
         self.joint_limits: Array = limits
-        self._targets, self._gains, self._speeds, self._bounds = np.zeros((4, len(joints)))
+        self._targets, self._gains, self._speeds = np.zeros((3, len(joints)))
+        self._bounds: Array = np.zeros(len(joints))
         self._driven = np.empty(0, dtype=np.intp)
         names = ("body_mass", "body_inertia", "dof_damping", "geom_rgba")
         self._as_built = {name: getattr(self.model, name).copy() for name in names}
         self._contacts = _Contacts(description, self.model)
-        self._floor = (1.0, 0.0, 0.0)
         self._pictures: _Pictures | None = None
+        self.set_floor(_LINK_FRICTION)
         for name, angle in body.start_angles.items():
             self.data.joint(name).qpos[:] = angle
         self._start = np.empty(mujoco.mj_stateSize(self.model, _STATE))
@@ -88,11 +89,12 @@ class MujocoWorld:
         option.timestep = steps.time_step / steps.substeps
         option.gravity[:] = (0.0, 0.0, -GRAVITY)
         option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        # Damping within the step would take from a motor what its constraint has given.
-        option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+        option.impratio = _FRICTION_RIGIDITY
+        # Damping within the step would take from a motor what its constraint has given, and a robot that explodes
+        # should be seen to do so, and not be back at its start.
+        option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP | mujoco.mjtDisableBit.mjDSBL_AUTORESET
         law = (2.0 * option.timestep, 1.0 / math.sqrt(4.0 * _ERROR_REDUCTION))
         model.eq_solref[:], model.jnt_solref[:], model.geom_solref[:] = law, law, law
-        option.impratio = _FRICTION_RIGIDITY
 
     def set_start(self) -> None:
         mujoco.mj_getState(self.model, self.data, self._start, _STATE)
@@ -101,20 +103,23 @@ class MujocoWorld:
         mujoco.mj_setState(self.model, self.data, self._start, _STATE)
 
     def simulate(self, calls: int = 1) -> None:
-        model, data, motors = self.model, self.data, self._driven
-        if not len(motors):
-            mujoco.mj_step(model, data, nstep=calls * self._substeps)
-        else:
-            angle_at, speed_at = self._angle_at[motors], self._speed_at[motors]
-            targets, gains, speeds = self._targets[motors], self._gains[motors], self._speeds[motors]
-            dt = model.opt.timestep
-            for _ in range(calls * self._substeps):
-                mujoco.mj_step1(model, data)
-                wanted = speeds + gains * (targets - data.qpos[angle_at]) / dt
-                # A motor is friction of a bounded torque against something that moves at the wanted speed.
-                data.efc_aref[data.ne : data.ne + data.nf] = (wanted - data.qvel[speed_at]) / dt
-                mujoco.mj_step2(model, data)
-        data.qfrc_applied[:] = 0.0
+        for _ in range(calls):
+            if len(self._driven):
+                self._step_with_motors()
+            else:
+                mujoco.mj_step(self.model, self.data, nstep=self._substeps)
+            self.data.qfrc_applied[:] = 0.0
+
+    def _step_with_motors(self) -> None:
+        """Lets a call pass in which each motor is friction, of a bounded torque, against what has its wanted speed."""
+        model, data, motors, dt = self.model, self.data, self._driven, self.model.opt.timestep
+        angle_at, speed_at = self._angle_at[motors], self._speed_at[motors]
+        targets, gains, speeds = self._targets[motors], self._gains[motors], self._speeds[motors]
+        for _ in range(self._substeps):
+            mujoco.mj_step1(model, data)
+            wanted = speeds + gains * (targets - data.qpos[angle_at]) / dt
+            data.efc_aref[data.ne : data.ne + data.nf] = (wanted - data.qvel[speed_at]) / dt
+            mujoco.mj_step2(model, data)
 
     def close(self) -> None:
         if self._pictures is not None:
@@ -166,7 +171,7 @@ class MujocoWorld:
     def _set_bounds(self, torques: Array) -> None:
         if (torques == self._bounds).all():
             return
-        self._bounds = torques
+        self._bounds = torques.copy()
         # PyBullet lets a motor give in each substep the impulse that its torque has in a whole call.
         self.model.dof_frictionloss[self._speed_at] = self._substeps * torques
         rigidity = np.where(torques < HOLDING_TORQUE, _MOTOR_RIGIDITY, _LOCK_RIGIDITY)

@@ -28,6 +28,7 @@ from famle_envs.minitaur import MinitaurEnv
 from famle_envs.quadruped import QuadrupedEnv
 from famle_envs.reacher import ReacherEnv
 from famle_envs.robot_env import RobotEnv
+from tests.helpers import draws
 from tests.worlds import masses, place_of, put, without_gravity
 
 Array = npt.NDArray[Any]
@@ -98,7 +99,7 @@ def test_no_engine_is_imported_before_a_robot_is_made() -> None:
 def test_robot_runs_in_the_engine_that_was_asked_for(make_env: MakeEnv, env_id: str, engine: str) -> None:
     env = make_env(env_id, engine=engine)
     assert env.unwrapped.engine == engine
-    assert engine in type(env.unwrapped.world).__name__.lower().replace("bullet", "pybullet")
+    assert type(env.unwrapped.world).__name__ == {"pybullet": "BulletWorld", "mujoco": "MujocoWorld"}[engine]
 
 
 def test_default_is_the_first_engine_that_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,7 +200,7 @@ def test_dead_joint_moves_only_as_it_is_moved(make_env: MakeEnv, robot: str, eng
     if "motor_gain" not in env.supported_faults:
         pytest.skip("has no dead joints")
     env.reset(seed=0, options={"situation": "joint 1 dead"})
-    if env.engine and not env.body.fixed:
+    if not env.body.fixed:
         without_gravity(env)
         put(env, (0.0, 0.0, 5.0))
     start = env.world.joint_states()[0]
@@ -278,6 +279,26 @@ def test_forgotten_robots_leave_no_worlds_behind(engine: str) -> None:
     worlds = [weakref.ref(ReacherEnv(engine=engine).world) for _ in range(30)]
     gc.collect()
     assert not any(world() for world in worlds)
+
+
+@pytest.mark.parametrize("used", ["env.render()", "env.step(env.action_space.sample())"])
+def test_robot_that_is_not_closed_ends_quietly_with_the_process(engine: str, used: str) -> None:
+    mode = repr("rgb_array" if draws(engine) else None)
+    done = run(
+        f"import gymnasium as gym, famle_envs\nenv = gym.make('FamleAnt-v0', engine={engine!r}, render_mode={mode})\n"
+        f"env.reset(seed=0)\n{used}"
+    )
+    assert done.returncode == 0
+    assert "Traceback" not in done.stderr
+
+
+def test_missing_opengl_is_named_with_the_remedy() -> None:
+    pytest.importorskip("mujoco")
+    done = run(
+        "import os\nos.environ['MUJOCO_GL'] = 'disabled'\nimport gymnasium as gym, famle_envs\n"
+        "env = gym.make('FamleAnt-v0', engine='mujoco', render_mode='rgb_array')\nenv.reset(seed=0)\nenv.render()"
+    )
+    assert "MuJoCo found no OpenGL to render with" in done.stderr
 
 
 @pytest.mark.parametrize("angle", [0.0, 1.0, -2.0, math.pi / 2])

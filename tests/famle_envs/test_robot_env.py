@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 import gc
+import importlib
 import math
 import pickle
 from collections.abc import Callable, Iterator
@@ -72,6 +73,12 @@ def test_every_preset_is_known_by_its_name(make: Make, env_id: str) -> None:
 def test_unknown_render_mode_is_refused(env_id: str, render_mode: str) -> None:
     with pytest.raises(ValueError, match=rf"render_mode must be None or one of \['rgb_array'\], got '{render_mode}'"):
         CLASSES[env_id](render_mode=render_mode)
+
+
+def test_old_module_still_works() -> None:
+    with pytest.warns(DeprecationWarning, match=r"famle_envs\.robot_env now"):
+        old = importlib.import_module("famle_envs.bullet_env")
+    assert old.BulletEnv is RobotEnv
 
 
 # --- Determinism ---
