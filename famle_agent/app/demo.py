@@ -70,8 +70,10 @@ def run_demo(
     situation, console = situation or shown.situation, Console()
     env = gym.make(known_robots()[robot].env_id, render_mode="rgb_array", **shown.env)
     try:
-        # A wrong name should fail before minutes of learning.
+        # A wrong name, or a machine that cannot render, should fail before minutes of learning.
         env.unwrapped.set_situation(situation)  # type: ignore[attr-defined]
+        env.reset(seed=seed)
+        env.render()
         label = env.get_wrapper_attr("situation").label
         agents = _with_and_without_adaptation(robot, seed, out, settings, console)
         runs: dict[str, list[Rollout]] = {}

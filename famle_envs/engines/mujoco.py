@@ -12,25 +12,21 @@ to which a time constant of 2 dt and a damping ratio of 1 / sqrt(0.8) amount. Ho
 from __future__ import annotations
 
 import math
-import os
-import sys
 from collections.abc import Mapping
 from importlib.resources import files
-from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from famle_envs.engines.mujoco_model import LINK_FRICTION, Contacts, compile_model
+from famle_envs.engines.mujoco_pictures import Pictures
 from famle_envs.engines.world import (
     DEFAULT_GAIN,
     FAULTY_COLOUR,
-    FIELD_OF_VIEW,
     GRAVITY,
     HOLDING_TORQUE,
-    MARKER_COLOUR,
-    PICTURE_SIZE,
     Array,
     Body,
     Camera,
@@ -45,11 +41,7 @@ __all__ = ["MujocoWorld"]
 _ERROR_REDUCTION = 0.2  # PyBullet's
 _MOTOR_RIGIDITY, _LOCK_RIGIDITY = 0.95, 0.999  # of constraints, where 1 would have no give at all
 _FRICTION_RIGIDITY = 10.0  # times that of the pressure; with MuJoCo's own 1, feet creep
-_LINK_FRICTION = 0.5  # PyBullet's, of a link whose description has none
-_LINK_DAMPING = 0.1  # the same, of contacts (N s/m)
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-_SEEN = 1  # the group of the shapes in a picture; those that collide are in group 0
-_FLOOR_COLOURS, _SKY_COLOUR = ((0.93, 0.93, 0.93), (0.63, 0.72, 0.93)), (1.0, 1.0, 1.0)
 
 
 class MujocoWorld:
@@ -62,7 +54,7 @@ class MujocoWorld:
 
     def __init__(self, body: Body, steps: Steps, marker: Marker | None) -> None:
         description = ElementTree.fromstring((files("famle_envs") / "assets" / body.description).read_text())
-        self.model = _compile(description, body, marker)
+        self.model = compile_model(description, body, marker)
         self.data = mujoco.MjData(self.model)
         self._set_laws(steps)
         self._substeps = steps.substeps
@@ -77,9 +69,9 @@ class MujocoWorld:
         self._driven = np.empty(0, dtype=np.intp)
         names = ("body_mass", "body_inertia", "dof_damping", "geom_rgba")
         self._as_built = {name: getattr(self.model, name).copy() for name in names}
-        self._contacts = _Contacts(description, self.model)
-        self._pictures: _Pictures | None = None
-        self.set_floor(_LINK_FRICTION)
+        self._contacts = Contacts(description, self.model)
+        self._pictures: Pictures | None = None
+        self.set_floor(LINK_FRICTION)
         for name, angle in body.start_angles.items():
             self.data.joint(name).qpos[:] = angle
         self._start = np.empty(mujoco.mj_stateSize(self.model, _STATE))
@@ -200,133 +192,6 @@ class MujocoWorld:
 
     def picture(self, camera: Camera) -> npt.NDArray[np.uint8]:
         if self._pictures is None:
-            self._pictures = _Pictures(self.model)
+            self._pictures = Pictures(self.model)
         mujoco.mj_kinematics(self.model, self.data)
         return self._pictures.take(self.model, self.data, camera)
-
-
-def _compile(description: ElementTree.Element, body: Body, marker: Marker | None) -> Any:
-    """The model of a robot and what stands around it."""
-    extension = ElementTree.SubElement(description, "mujoco")
-    ElementTree.SubElement(extension, "compiler", discardvisual="false", fusestatic="false")
-    spec = mujoco.MjSpec.from_string(ElementTree.tostring(description, encoding="unicode"))
-    world, seen = spec.worldbody, {"group": _SEEN, "contype": 0, "conaffinity": 0}
-    base = world.first_body()
-    if not body.fixed:
-        base.add_freejoint()
-        base.pos = (0.0, 0.0, body.height)
-    # A plane touches what is in the world's way, but no link another.
-    for geom in spec.geoms:
-        geom.contype, geom.conaffinity, geom.priority = int(geom.group != _SEEN), 0, 1
-    if not body.fixed:
-        floor = {**seen, "conaffinity": 1, "material": "floor"}
-        world.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 1.0), **floor)
-    for ends in body.loops:
-        sites = [spec.body(link).add_site(name=f"{link} end", pos=point).name for link, point in ends]
-        spec.add_equality(
-            type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_SITE, name1=sites[0], name2=sites[1]
-        )
-    if marker is not None:
-        kind = mujoco.mjtGeom.mjGEOM_CYLINDER if marker.height else mujoco.mjtGeom.mjGEOM_SPHERE
-        size = (marker.radius, 0.5 * marker.height, 0.0)
-        world.add_geom(type=kind, size=size, pos=marker.position, rgba=MARKER_COLOUR, **seen)
-    _light(spec)
-    return spec.compile()
-
-
-def _light(spec: Any) -> None:
-    """Gives a model its floor's material, its sky and its light."""
-    one, other = _FLOOR_COLOURS
-    texture, builtin = mujoco.mjtTexture, mujoco.mjtBuiltin
-    size = {"width": 64, "height": 64}
-    spec.add_texture(
-        name="tiles", type=texture.mjTEXTURE_2D, builtin=builtin.mjBUILTIN_CHECKER, rgb1=one, rgb2=other, **size
-    )
-    sky = {"rgb1": _SKY_COLOUR, "rgb2": _SKY_COLOUR, **size}
-    spec.add_texture(name="sky", type=texture.mjTEXTURE_SKYBOX, builtin=builtin.mjBUILTIN_FLAT, **sky)
-    floor = spec.add_material(name="floor", texrepeat=(0.5, 0.5), texuniform=True, specular=0.0)
-    floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
-    light, whole = spec.visual.headlight, spec.visual.global_
-    light.ambient, light.diffuse, light.specular = (0.5,) * 3, (0.5,) * 3, (0.0,) * 3
-    whole.fovy, whole.offwidth, whole.offheight = FIELD_OF_VIEW, PICTURE_SIZE, PICTURE_SIZE
-
-
-class _Contacts:
-    """How the links of a robot touch the floor; all of it is kept in their shapes, which outrank the floor's."""
-
-    def __init__(self, description: ElementTree.Element, model: Any) -> None:
-        self._geoms = np.flatnonzero(model.geom_contype)
-        self._links = model.geom_bodyid[self._geoms]
-        names = [model.body(link).name for link in self._links]
-        said = {link.get("name"): link for link in description.iter("link")}
-
-        def values(name: str, default: float) -> Array:
-            elements = [said[link].find(f"contact/{name}") for link in names]
-            return np.array([default if element is None else float(element.attrib["value"]) for element in elements])
-
-        self._friction = values("lateral_friction", _LINK_FRICTION)
-        self._stiffness, self._damping = values("stiffness", math.inf), values("damping", _LINK_DAMPING)
-        self._rigid = model.geom_solref[self._geoms].copy(), model.geom_solimp[self._geoms].copy()
-
-    def apply(self, model: Any, friction: float, stiffness: float, damping: float) -> None:
-        """Combines the floor's with each link's: frictions multiply, springs are in series, dampings add up."""
-        model.geom_friction[self._geoms, 0] = friction * self._friction
-        model.geom_solref[self._geoms], model.geom_solimp[self._geoms] = self._rigid
-        spring = 1.0 / (1.0 / self._stiffness + (1.0 / stiffness if stiffness else 0.0) + 1e-18)
-        soft = spring < 1e17
-        dt, spring = model.opt.timestep, spring[soft]
-        damper = self._damping[soft] + (damping if stiffness else _LINK_DAMPING)
-        # A spring and a damper at the end of a step are f = -(k dt + c) (v + a dt) - k r = (a_ref - a) / give,
-        give = 1.0 / (dt * (spring * dt + damper))
-        # which MuJoCo has where the rigidity is the part of the give that is the link's own.
-        own = model.body_invweight0[self._links[soft], 0]
-        rigidity = np.clip(own / (own + give), 1e-4, 0.9999)
-        law = np.stack([-rigidity * spring * give, -rigidity / dt * np.ones_like(give)], axis=1)
-        model.geom_solref[self._geoms[soft]] = law
-        model.geom_solimp[self._geoms[soft], :2] = rigidity[:, None]
-
-
-class _Pictures:
-    """Renders a model without a window."""
-
-    def __init__(self, model: Any) -> None:
-        try:
-            self._context = _gl_context()(PICTURE_SIZE, PICTURE_SIZE)
-            self._context.make_current()
-            self._renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        except Exception as error:  # each platform library has exceptions of its own
-            raise RuntimeError(
-                "MuJoCo found no OpenGL to render with. Without a screen it needs EGL (package libegl1 on Debian) or "
-                "OSMesa (libosmesa6, and MUJOCO_GL=osmesa in the environment); or use engine='pybullet'."
-            ) from error
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._renderer)
-        self._scene = mujoco.MjvScene(model, maxgeom=1000)
-        self._options = mujoco.MjvOption()
-        self._options.geomgroup[0] = 0  # shapes that collide, in front of those that one sees
-
-    def take(self, model: Any, data: Any, camera: Camera) -> npt.NDArray[np.uint8]:
-        self._context.make_current()
-        view = mujoco.MjvCamera()
-        view.lookat[:], view.distance = camera.target, camera.distance
-        view.azimuth, view.elevation = camera.yaw + 90.0, camera.pitch
-        mujoco.mjv_updateScene(model, data, self._options, None, view, mujoco.mjtCatBit.mjCAT_ALL, self._scene)
-        pixels = np.empty((PICTURE_SIZE, PICTURE_SIZE, 3), dtype=np.uint8)
-        rect = mujoco.MjrRect(0, 0, PICTURE_SIZE, PICTURE_SIZE)
-        mujoco.mjr_render(rect, self._scene, self._renderer)
-        mujoco.mjr_readPixels(pixels, None, rect, self._renderer)
-        return np.flipud(pixels).copy()
-
-    def close(self) -> None:
-        self._context.make_current()
-        self._renderer.free()
-        self._context.free()
-
-
-def _gl_context() -> Any:
-    """MuJoCo's own choice, which is a window of the screen; EGL where there is none."""
-    on_a_screen = {"DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"} & set(os.environ)
-    if sys.platform == "linux" and not on_a_screen:
-        from mujoco.egl import GLContext
-
-        return GLContext
-    return mujoco.GLContext

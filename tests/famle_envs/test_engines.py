@@ -49,12 +49,11 @@ FAULTY = {
     "FamleMinitaur-v0": "joint 4 locked, friction x 0.5, base mass x 1.5",
 }
 NO_BULLET = """
-import sys
-sys.modules["pybullet"] = None  # as where it is not installed
-from importlib import util
-find_spec = util.find_spec
-util.find_spec = lambda name, *args: None if name == "pybullet" else find_spec(name, *args)
+from importlib.machinery import PathFinder
+find_spec = PathFinder.find_spec
+PathFinder.find_spec = lambda name, *args: None if name.startswith("pybullet") else find_spec(name, *args)
 """
+"""What makes a process one in which PyBullet is not installed."""
 
 
 @pytest.fixture(params=list(ROBOTS))
