@@ -5,8 +5,8 @@ step. MuJoCo's pull towards a reference acceleration, so that this is
 
     a_ref = -v / dt - 0.2 r / dt^2,
 
-to which a time constant of 2 dt and a damping ratio of 1 / sqrt(0.8) amount. How rigid they are is left at MuJoCo's own
-0.9 to 0.95.
+to which a time constant of 2 dt and a damping ratio of 1 / sqrt(0.8) amount. Contacts, joint limits and loops are as
+rigid as MuJoCo makes them by default, 0.9 to 0.95.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ class MujocoWorld:
     """
 
     def __init__(self, body: Body, steps: Steps, marker: Marker | None) -> None:
-        description = ElementTree.fromstring((files("famle_envs") / "assets" / body.description).read_text())
+        file = files("famle_envs") / "assets" / body.description
+        description = ElementTree.fromstring(file.read_text(encoding="utf-8"))
         self.model = compile_model(description, body, marker)
         self.data = mujoco.MjData(self.model)
         self._set_laws(steps)

@@ -104,7 +104,6 @@ class Contacts:
         # which MuJoCo has where the rigidity is the part of the give that is the link's own.
         own = model.body_invweight0[self._links[soft], 0]
         rigidity = np.clip(own / (own + give), 1e-4, 0.9999)
-        model.geom_solref[self._geoms[soft]] = -rigidity[:, None] * np.stack(
-            [spring * give, np.full_like(give, 1.0 / dt)], 1
-        )
+        model.geom_solref[self._geoms[soft], 0] = -rigidity * spring * give
+        model.geom_solref[self._geoms[soft], 1] = -rigidity / dt
         model.geom_solimp[self._geoms[soft], :2] = rigidity[:, None]
