@@ -23,7 +23,8 @@ from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
 from famle_agent import FAMLE
 from famle_envs.ant import AntEnv
-from famle_envs.engines import ENGINES, resolve_engine
+from famle_envs.engines import ENGINES, make_world, resolve_engine
+from famle_envs.engines.world import World
 from famle_envs.minitaur import MinitaurEnv
 from famle_envs.quadruped import QuadrupedEnv
 from famle_envs.reacher import ReacherEnv
@@ -144,6 +145,20 @@ def test_shipped_model_is_taken_for_a_robot_in_either_engine(engine: str) -> Non
     env = gym.make("FamleAnt-v0", engine=engine)
     agent = FAMLE(env, device="cpu")
     assert agent.dynamics is not None
+    env.close()
+
+
+def test_agent_simulates_in_the_engine_of_its_robot(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    env, engines = gym.make("FamleReacher-v0", engine=engine), []
+
+    def make_and_note(engine: str, *args: Any) -> World:
+        engines.append(engine)
+        return make_world(engine, *args)
+
+    monkeypatch.setattr("famle_envs.robot_env.make_world", make_and_note)
+    FAMLE(env, seed=0, device="cpu", transitions_per_situation=1).collect()
+    assert len(engines) >= 11
+    assert set(engines) == {engine}
     env.close()
 
 
