@@ -47,7 +47,10 @@ class Body:
 
 @dataclass(frozen=True)
 class Steps:
-    """How time passes: a call of the simulator lasts ``time_step`` s and is divided into ``substeps``."""
+    """How time passes: a call of the simulator lasts ``time_step`` s and is divided into ``substeps``.
+
+    ``solver_iterations`` are PyBullet's; MuJoCo's solver goes on until it has converged.
+    """
 
     time_step: float
     substeps: int
@@ -77,7 +80,8 @@ class World(Protocol):
     """One robot in one private world. Arrays have an entry for each motorised joint.
 
     A motor tries to give its joint a speed with a torque within its bounds, in each physics step anew. A servo asks
-    for the speed that makes good a part of the angle's error, its gain.
+    for the speed that makes good a part of the angle's error, its gain. A bound is one of impulse: each physics step of a
+    call may give what the torque gives in the whole call.
     """
 
     joint_limits: Array
