@@ -80,8 +80,8 @@ class World(Protocol):
     """One robot in one private world. Arrays have an entry for each motorised joint.
 
     A motor tries to give its joint a speed with a torque within its bounds, in each physics step anew. A servo asks
-    for the speed that makes good a part of the angle's error, its gain. A bound is one of impulse: each physics step of a
-    call may give what the torque gives in the whole call.
+    for the speed that makes good a part of the angle's error, its gain. A bound is one of impulse: each physics step of
+    a call may give what the torque gives in the whole call.
     """
 
     joint_limits: Array
