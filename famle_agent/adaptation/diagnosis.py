@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-__all__ = ["Diagnosis"]
+__all__ = ["STRANGE", "Diagnosis"]
 
-_STRANGE = 2.5  # times the errors of simulation; robots in another simulator's profile stay below
+STRANGE = 2.5  # times the errors of simulation; robots in another simulator's profile stay below
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Diagnosis:
     @property
     def is_known(self) -> bool:
         """Whether the robot does what some training situation, or the sum of two, predicts."""
-        return self.error < _STRANGE
+        return self.error < STRANGE
 
     def __str__(self) -> str:
         if not self.steps:
