@@ -33,13 +33,19 @@ SMALL: dict[str, Any] = {
     "inner_steps": 20,
     "adapt_every": 2,
     "memory_size": 50,
-    "selection_size": 0,
+    "hazard": 0.0,
+    "likelihood_power": 1.0,
+    "compose": False,
+    "posterior_sampling": False,
+    "adapt_steps": 20,
+    "adapt_batch_size": 64,
+    "adapt_embedding_lr": 0.05,
     "horizon": 10,
     "candidates": 100,
     "planner_iterations": 3,
     "elites": 10,
 }
-"""Settings of an agent that knows its situations after a few seconds of learning."""
+"""Settings of an agent that knows its situations after a few seconds of learning, and adapts much as in the paper."""
 
 QUICK: dict[str, Any] = {"adapt_every": 5, "adapt_steps": 2, "candidates": 20, "planner_iterations": 1}
 """Settings of a loaded agent for tests that need it to run and not to be good."""
