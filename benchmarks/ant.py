@@ -40,17 +40,15 @@ from famle_envs.wrappers import RandomSituation
 ENV_ID = "FamleAnt-v0"
 WALKS = 0.8  # m/s
 BIN = 50  # steps of a stored mean speed
-ADAPTS: dict[str, Any] = {"adapt_every": 10, "adapt_steps": 10, "adapt_lr": 3e-4, "adapt_embedding_lr": 1e-2}
-
 VARIANTS: dict[str, dict[str, Any]] = {
     "famle": {},
     "famle-48": {"candidates": 48},
     "famle-frozen": {"adapt_every": 0},
-    "famle-nearest": {"compose": False},
-    "famle-window": {"hazard": 0.0, "likelihood_power": 1.0, "memory_size": 100},
-    "famle-h": {**ADAPTS, "adapt_lr": 0.0},
-    "famle-theta": ADAPTS,
-    "famle-validated": {**ADAPTS, "validation_size": 10},
+    "famle-select": {"adapt_steps": 0},
+    "famle-nearest": {"adapt_steps": 0, "compose": False, "posterior_sampling": False},
+    "famle-window": {"hazard": 0.0, "likelihood_power": 1.0, "selection_size": 100},
+    "famle-h": {"adapt_lr": 0.0},
+    "famle-validated": {"validation_size": 10},
     "random-shooting": {"planner": "random_shooting", "candidates": 10_000},
 }
 """The shipped agent with settings changed."""
@@ -117,7 +115,7 @@ def without_embeddings(task: Task) -> FAMLE:
         "transitions_per_situation": n * simulation.transitions(0),
         "round_transitions": n * simulation.transitions(1),
     }
-    agent = FAMLE("ant", seed=0, device="cpu", pretrained=False, compose=False, **budget, **ADAPTS)
+    agent = FAMLE("ant", seed=0, device="cpu", pretrained=False, compose=False, **budget)
     path = task.cache / "ant-without-embeddings.zip"
     mixed = [lambda: RandomSituation(gym.make(ENV_ID))]
     return from_cache(agent, path, lambda agent: agent.meta_learn(mixed, folder=path.with_suffix("")))

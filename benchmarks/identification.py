@@ -45,7 +45,7 @@ CANDIDATES = {"training situations": False, "sums too": True}
 ADAPTATIONS = {
     "nearest embedding": (False, 0),
     "sums of embeddings": (True, 0),
-    "and steps on theta and h": (True, ant.ADAPTS["adapt_steps"]),
+    "and steps on theta and h": (True, 10),
 }
 """Whether sums of embeddings are candidates, and the number of gradient steps."""
 
@@ -151,7 +151,7 @@ def adapted(model: Dynamics, candidates: Candidates, data: Transitions, n: int, 
     log_p = candidates.log_likelihood(model, model.encode(obs, action, next_obs))
     memory = Memory.full(obs, action, next_obs, log_p)
     belief = replace(belief, log_posterior=window_posterior(candidates, memory))
-    inner_loop = InnerLoop(steps, ant.ADAPTS["adapt_lr"], ant.ADAPTS["adapt_embedding_lr"], "adam")
+    inner_loop = InnerLoop(steps, lr=3e-4, embedding_lr=1e-2, optimizer="adam")
     return descend(model, select(model, candidates, belief), memory, inner_loop)
 
 

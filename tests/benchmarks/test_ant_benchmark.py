@@ -52,13 +52,13 @@ def test_single_episode_is_not_for_model_free_methods(tmp_path: Path) -> None:
         run("ppo", [Task("ant", 0, damage_of("unseen", 0), tmp_path)], Args())
 
 
-@pytest.mark.parametrize("method", ["famle-nearest", "famle-theta", "members-2", "random-shooting"])
+@pytest.mark.parametrize("method", ["famle-nearest", "famle-select", "members-2", "random-shooting"])
 def test_methods_are_the_shipped_agent_with_something_changed(method: str) -> None:
     agent: Any = ANT_METHODS[method].agent(Task("ant", 3, damage_of("unseen", 3), Path("unused")))
     settings = agent.config.to_dict()
     assert agent.dynamics.members == (2 if method == "members-2" else 4)
     assert settings["compose"] == (method != "famle-nearest")
-    assert bool(settings["adapt_steps"]) == (method == "famle-theta")
+    assert bool(settings["adapt_steps"]) == (method not in ("famle-nearest", "famle-select"))
     assert settings["planner"] == ("random_shooting" if method == "random-shooting" else "icem")
     agent.get_env().close()
 
