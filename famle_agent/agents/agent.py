@@ -35,7 +35,7 @@ from famle_agent.agents.policy import AdaptivePolicy
 from famle_agent.agents.presets import make_env, robot_of
 from famle_agent.agents.tensorboard import log_adaptations, log_embeddings, log_posterior
 from famle_agent.agents.world_model import Interface
-from famle_agent.data.action_scaling import check_action, check_observation, to_action_space
+from famle_agent.data.action_scaling import to_action_space
 from famle_agent.data.envs import (
     SituationEnvs,
     SituationsLike,
@@ -47,8 +47,11 @@ from famle_agent.data.envs import (
     situation_envs,
     special_dims,
 )
+from famle_agent.data.gate import check_action, check_observation, vec_observations, vec_step
 from famle_agent.data.policies import MakePolicy
+from famle_agent.data.probe import check_reward_fn, check_termination_fn
 from famle_agent.data.transitions import Transitions
+from famle_agent.data.watch import VecWatch
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import prepare_torch
 from famle_agent.models.reward import RewardFn, TerminationFn
@@ -156,6 +159,8 @@ class ModelBasedAgent(BaseAlgorithm):
             dims = special_dims(self.env, given, config.model.egocentric, config.model.raw_angles)
             self.policy.robot = Interface(self.observation_space, self.action_space, dims)
             self._take_reward(self.env)
+        elif reward_fn is not None and not callable(reward_fn):
+            raise ValueError(f"reward_fn must be a function, got {reward_fn!r}.")
         self._setup_model()
         if pretrained and robot.pretrained is not None:
             with as_file(robot.pretrained) as file:
@@ -180,6 +185,8 @@ class ModelBasedAgent(BaseAlgorithm):
         self.policy.world = self._live = None
         self.num_iterations, self.last_check = 0, None
         self._served: object = None
+        self._refused: OnlineState | None = None  # the state whose last observation was refused
+        self._calls = 0  # of the environment's steps and resets when learn() last ended
         self._warned_of_divergence = False
         self.generator.seed()
         self.set_random_seed(self.seed)
@@ -200,18 +207,23 @@ class ModelBasedAgent(BaseAlgorithm):
         Raises:
             ValueError: The spaces differ, or the environment normalises observations.
         """
-        wrapped = self._wrap_env(env, self.verbose)
+        wrapped = self._wrap_env(make_env(env), self.verbose)
         check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
         self._env_spec = _description(wrapped)
         self._take_reward(wrapped)
         self.n_envs = wrapped.num_envs
         super().set_env(wrapped, force_reset)
+        self._calls = VecWatch(wrapped).calls
 
     def _take_reward(self, env: VecEnv) -> None:
         """Looks for what to maximise in an environment, unless the user has said it."""
         if self.policy.user_reward_fn is None:
             self.policy.env_reward_fn = planning_reward(env, self.config.planning_reward)
         self.policy.env_termination_fn = env_attribute(env, "termination_fn", None)
+        if (reward_fn := self.policy.known_reward_fn) is not None:
+            check_reward_fn(reward_fn, self.observation_space, self.action_space, self.device)
+        if (termination_fn := self.policy.known_termination_fn) is not None:
+            check_termination_fn(termination_fn, self.observation_space, self.device)
 
     def _require_env(self) -> VecEnv:
         if self.env is None:
@@ -426,22 +438,30 @@ class ModelBasedAgent(BaseAlgorithm):
         env = self._require_env()
         if self.policy.world is None:
             self.meta_learn(progress_bar=progress_bar)
+        if VecWatch(env).calls != self._calls:  # somebody else has moved the robots since the last learn()
+            self._last_obs = None
         total_timesteps, hooks = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         hooks.on_training_start(locals(), globals())
-        controller, state = self.controller, self.state_of(env.num_envs)
-        starts = torch.as_tensor(self._last_episode_starts, dtype=torch.bool, device=self.device)
-        nobody = torch.zeros_like(starts)
+        controller, state, watch = self.controller, self.state_of(env.num_envs), VecWatch(env)
+        self._calls = watch.calls
         while self.num_timesteps < total_timesteps:
             hooks.on_rollout_start()
-            action, state = controller.act(state, self.policy.builder.tensor(self._last_obs), starts, self.generator)
-            new_obs, rewards, dones, infos = env.step(to_action_space(action, self.action_space))
-            self.num_timesteps += env.num_envs
-            reached = self.policy.builder.tensor(_before_reset(new_obs, dones, infos))
-            state = self._live = self._observed(controller.observe(state, reached, nobody))
-            self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
-            starts = torch.as_tensor(dones, device=self.device)
+            if watch.calls != self._calls:  # a callback has moved the robots
+                self._last_obs, self._last_episode_starts = env.reset(), np.ones(env.num_envs, dtype=bool)  # type: ignore[assignment]
+            starts = torch.as_tensor(self._last_episode_starts, dtype=torch.bool, device=self.device)
+            obs = self.policy.builder.tensor(vec_observations(self._last_obs, env))
+            action, state = controller.act(state, obs, starts, self.generator)
+            self._last_obs, resets = None, watch.resets()  # the next learn() resets, should this step fail
+            step = vec_step(env, to_action_space(action, self.action_space))
+            self.num_timesteps, self._calls = self.num_timesteps + env.num_envs, watch.calls
+            new_obs, rewards, dones, infos = step.obs, step.rewards, step.dones, step.infos  # by names callbacks know
+            reset_alone = watch.resets() - resets != dones if len(resets) else np.zeros_like(dones)
+            lost = torch.as_tensor(reset_alone | ~step.known, device=self.device)
+            reached = self.policy.builder.tensor(step.reached)
+            state = self._live = self._observed(controller.observe(state, reached, lost))
+            self._last_obs, self._last_episode_starts = new_obs, dones | reset_alone
             self._update_info_buffer(infos, dones)
             hooks.update_locals(locals())
             if not hooks.on_step():
@@ -484,7 +504,9 @@ class ModelBasedAgent(BaseAlgorithm):
         Args:
             observation: (obs_dim,) for one robot or (B, obs_dim) for B.
             state: What the last call returned, or None.
-            episode_start: Whether each robot has just been reset, (B,). The transition across it is dropped.
+            episode_start: Whether each robot has just been reset, (B,). The transition across it is dropped. After a
+                step of Gymnasium's vector environments these are the robots whose episode has ended in that step; with
+                ``AutoresetMode.NEXT_STEP``, their default, those whose episode has ended in the step before.
             deterministic: Whether the planner draws the same candidates at each call, so that equal observations and
                 states give equal actions. Without a state, an agent that has lived on a robot goes on from the plan of
                 its last call.
@@ -497,7 +519,13 @@ class ModelBasedAgent(BaseAlgorithm):
             ValueError: The observation has the wrong shape or is not finite.
         """
         controller = self.controller
-        numbers = check_observation(observation, self.observation_space)
+        try:
+            numbers = check_observation(observation, self.observation_space)
+        except ValueError:
+            self._refused = state  # whose next observation is not one step behind its last one
+            raise
+        if state is not None and state is self._refused:
+            state = replace(state, last=None)
         obs = self.policy.builder.tensor(np.atleast_2d(numbers))
         starts = torch.zeros(len(obs), dtype=torch.bool, device=self.device)
         if episode_start is not None:
@@ -767,12 +795,6 @@ class ModelBasedAgent(BaseAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ([] if self.policy.world is None else ["dynamics"]), []
-
-
-def _before_reset(obs: Any, dones: Array, infos: Sequence[Mapping[str, Any]]) -> Array:
-    """Where robots have got to; of one whose episode has ended, ``obs`` is already the next one's start."""
-    ended = [info["terminal_observation"] if done else own for own, done, info in zip(obs, dones, infos, strict=True)]
-    return np.stack(ended)
 
 
 def _description(env: VecEnv) -> dict[str, Any] | None:

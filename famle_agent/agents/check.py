@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
+from famle_agent.data import gate
 from famle_agent.data.envs import SituationEnvs
 
 __all__ = ["Check", "check_plans"]
@@ -90,16 +91,17 @@ def check_plans(agent: Plans, envs: SituationEnvs, seed: int, steps: int = 200, 
 
 def _returns(envs: Sequence[gym.Env[Any, Any]], act: Callable[[Array], Array], seed: int, steps: int) -> Array:
     """The return of one episode in each environment, (n,); one that has ended waits for the others."""
-    obs = np.stack([env.reset(seed=seed)[0] for env in envs]).astype(np.float32)
+    obs = np.stack([gate.reset(env, seed=seed)[0] for env in envs]).astype(np.float32)
     total, lives = np.zeros(len(envs)), np.ones(len(envs), dtype=bool)
     for _ in range(steps):
         actions = act(obs).astype(envs[0].action_space.dtype)
         for i, env in enumerate(envs):
             if not lives[i]:
                 continue
-            obs[i], reward, terminated, truncated, _ = env.step(actions[i])
-            total[i] += float(reward)
-            lives[i] = not (terminated or truncated)
+            step = gate.step(env, actions[i])
+            obs[i] = step.obs
+            total[i] += step.reward
+            lives[i] = not (step.terminated or step.truncated)
         if not lives.any():
             break
     return total

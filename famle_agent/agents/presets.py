@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import yaml
+from gymnasium.vector import VectorEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from famle_agent.agents.config import Config
@@ -94,8 +95,16 @@ def make_env(env: str | gym.Env[Any, Any] | VecEnv) -> gym.Env[Any, Any] | VecEn
     """Makes an environment from a robot's short name or a Gymnasium id; passes anything else through.
 
     Raises:
-        ValueError: The name is neither a known robot nor a registered id.
+        ValueError: The name is neither a known robot nor a registered id, or it is one of Gymnasium's vector
+            environments.
     """
+    if isinstance(env, VectorEnv):
+        raise ValueError(
+            "Gymnasium's vector environments do not tell alike in all their modes where an episode has ended. Give one "
+            "of Stable-Baselines3: DummyVecEnv([lambda: gym.make(...)] * n). To drive one of Gymnasium with predict() "
+            "yourself, pass as episode_start whose episode ended in the last step (SAME_STEP, DISABLED), or in the one "
+            "before it (NEXT_STEP, the default)."
+        )
     if not isinstance(env, str):
         return env
     robots = {name: robot.env_id for name, robot in known_robots().items() if robot.env_id}

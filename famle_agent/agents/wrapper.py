@@ -10,6 +10,10 @@ import numpy.typing as npt
 from gymnasium.utils import RecordConstructorArgs
 
 from famle_agent.agents.agent import ModelBasedAgent
+from famle_agent.agents.presets import make_env
+from famle_agent.data import gate
+from famle_agent.data.gate import check_action
+from famle_agent.data.watch import Watch
 
 __all__ = ["FAMLEWrapper"]
 
@@ -35,38 +39,60 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
 
     def __init__(self, env: gym.Env[Array, Array], agent: ModelBasedAgent) -> None:
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, agent=agent)
-        gym.Wrapper.__init__(self, env)
+        gym.Wrapper.__init__(self, make_env(env))  # type: ignore[arg-type]
         agent.posterior()  # an agent without a model should say so here, not in the middle of a run
         if env.observation_space != agent.observation_space or env.action_space != agent.action_space:
             raise ValueError(
                 f"The environment's spaces, {env.observation_space} and {env.action_space}, are not the agent's, "
                 f"{agent.observation_space} and {agent.action_space}."
             )
-        self.agent = agent
-        self._obs: Array | None = None
+        self.agent, self._watch = agent, Watch(env)
+        self._obs: Array | None = None  # None too where nobody knows where the robot is
+        self._begun = False
+        self._calls = self._resets = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Resets the environment; the agent's plan is void, its memory stays."""
-        obs, info = self.env.reset(seed=seed, options=options)
+        self._obs = None
+        obs, info = gate.reset(self.env, seed=seed, options=options)
         self.agent.serve(self)
         self.agent.begin_episode()
-        self._obs = np.array(obs)  # a copy: an environment may fill the same array again
+        self._begun = True
+        self._know(obs)
         return obs, info | {"famle": self._belief()}
 
     def step(self, action: Array) -> tuple[Array, Any, bool, bool, dict[str, Any]]:
-        """Steps the environment and shows the transition to the agent.
+        """Steps the environment and shows the transition to the agent, if it was one step and nothing else.
+
+        What lies across a reset, a step that failed, or a time in which somebody else moved the robot is not shown.
 
         Raises:
             RuntimeError: Another wrapper was reset with the same agent.
-            ValueError: The environment returned an observation that is not finite.
+            ValueError: The action, or something that the environment returned, has a wrong type or shape or is not
+                finite.
         """
-        if self._obs is None:
+        if not self._begun:
             raise gym.error.ResetNeeded("Call reset() before step().")
         self.agent.serve(self, takes_over=False)
-        obs, reward, terminated, truncated, info = self.env.step(action)
-        self.agent.observe(self._obs, action, obs)
-        self._obs = np.array(obs)
-        return obs, reward, terminated, truncated, info | {"famle": self._belief()}
+        check_action(action, self.agent.action_space)  # before anything moves
+        commanded = np.array(action)
+        if self._watch.resets != self._resets:  # by somebody else
+            self.agent.begin_episode()
+        resets, before = self._watch.resets, self._obs if self._watch.calls == self._calls else None
+        self._obs = None
+        step = gate.step(self.env, commanded)
+        was_reset = self._watch.resets != resets
+        reached = step.final_obs if was_reset else step.obs
+        if before is not None and reached is not None:
+            self.agent.observe(before, commanded, reached)
+        if was_reset:
+            self.agent.begin_episode()
+        self._know(step.obs)
+        return step.obs, step.reward, step.terminated, step.truncated, step.info | {"famle": self._belief()}
+
+    def _know(self, obs: Array) -> None:
+        """Notes where the robot is."""
+        self._obs, self._calls, self._resets = obs.copy(), self._watch.calls, self._watch.resets
 
     def _belief(self) -> dict[str, Any]:
         posterior, belief = self.agent.posterior(), self.agent.belief

@@ -1,4 +1,4 @@
-"""Between the units of an environment and those of the model, with the checks that belong there."""
+"""Between the units of an environment and those of the model."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-__all__ = ["ActionScale", "check_action", "check_observation", "to_action_space"]
+__all__ = ["ActionScale", "to_action_space"]
 
 Array = npt.NDArray[Any]
 
@@ -49,37 +49,3 @@ def to_action_space(action: Tensor, space: spaces.Box) -> Array:
     """Actions in [-1, 1], (..., action_dim), as arrays that lie in an action space, rounding included."""
     actions = ActionScale.of(space, action.device).from_unit(action).cpu().numpy()
     return np.clip(actions.astype(space.dtype), space.low, space.high)
-
-
-def check_observation(observation: Any, space: spaces.Box) -> Array:
-    """An observation (obs_dim,) or (B, obs_dim) as an array.
-
-    Raises:
-        ValueError: It has another shape, is not finite, or is the pair that Gymnasium's ``reset`` returns.
-    """
-    if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
-        raise ValueError("Got (obs, info), as Gymnasium's reset() returns it; give obs alone.")
-    return _check("observation", observation, space)
-
-
-def check_action(action: Any, space: spaces.Box) -> Array:
-    """An action (action_dim,) or (B, action_dim) as an array.
-
-    Raises:
-        ValueError: It has another shape or is not finite.
-    """
-    return _check("action", action, space)
-
-
-def _check(name: str, values: Any, space: spaces.Box) -> Array:
-    try:
-        array = np.array(values, dtype=np.float32)  # a copy: an environment may fill the same array again
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"The {name} must be an array of numbers, got {type(values).__name__}.") from error
-    if array.ndim not in (1, 2) or array.shape[-1:] != space.shape:
-        raise ValueError(
-            f"The {name} must have shape {space.shape}, or (B, {space.shape[0]}) for B robots, got {array.shape}."
-        )
-    if not np.isfinite(array).all():
-        raise ValueError(f"The {name} holds NaN or infinite values: {array}. Check the robot's sensors and commands.")
-    return array

@@ -12,8 +12,10 @@ import numpy as np
 import torch
 from joblib import delayed
 
+from famle_agent.data import gate
 from famle_agent.data.policies import MakePolicy
 from famle_agent.data.transitions import EnvSource, Transitions
+from famle_agent.data.watch import Watch
 from famle_agent.utils.parallel import as_completed
 
 __all__ = ["collect"]
@@ -114,19 +116,21 @@ def _run_policy(env: gym.Env[Any, Any], task: _Task) -> Transitions:
     policy = task.make_policy(env, task.index, np.random.default_rng(task.sequence))
     rows: list[tuple[Any, Any, Any, Any]] = []
     ended: list[bool] = []
-    obs = np.array(env.reset(seed=int(task.sequence.generate_state(1)[0]))[0])
+    watch = Watch(env)
+    obs, _ = gate.reset(env, seed=int(task.sequence.generate_state(1)[0]))
     episode_start, age = True, 0
     while len(rows) < task.n:
         action = policy(obs, episode_start)
-        next_obs, reward, terminated, truncated, _ = env.step(action)
-        next_obs = np.array(next_obs)  # a copy: an environment may fill the same array again
-        rows.append((obs, action, reward, next_obs))
-        ended.append(bool(terminated))
+        resets = watch.resets
+        step = gate.step(env, action)
+        gate.check_not_reset(env, watch.resets - resets)
+        rows.append((obs, action, step.reward, step.obs))
+        ended.append(step.terminated)
         age += 1
-        obs, episode_start = next_obs, terminated or truncated or age == task.episode_length
+        obs, episode_start = step.obs, step.terminated or step.truncated or age == task.episode_length
         if episode_start:
-            obs, age = np.array(env.reset()[0]), 0
-    columns = [np.array(column, dtype=np.float32)[None] for column in zip(*rows, strict=True)]
+            (obs, _), age = gate.reset(env), 0
+    columns = [np.array(column)[None] for column in zip(*rows, strict=True)]
     obs_, action_, reward_, next_obs_ = columns
     terminated_ = np.array([ended]) if any(ended) else None
     return Transitions(obs_, action_, reward_, next_obs_, (task.situation,), terminated_)

@@ -15,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
+from famle_agent.data.gate import floats
 from famle_agent.utils.atomic_write import whole_file
 
 __all__ = ["EnvSource", "Transitions"]
@@ -48,6 +49,8 @@ class Transitions:
     terminated: npt.NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
+        for name in ("obs", "action", "reward", "next_obs"):
+            object.__setattr__(self, name, floats(name, getattr(self, name)))  # which nobody else can change
         shape = (len(self.situations), self.obs.shape[1] if self.obs.ndim == 3 else -1)
         if 0 in shape:
             raise ValueError("There are no transitions; collect at least one in at least one situation.")
@@ -57,8 +60,13 @@ class Transitions:
                 raise ValueError(f"{name} has shape {value.shape}; expected {shape} and the dimensions behind it.")
             if not np.isfinite(value).all():
                 raise ValueError(f"{name} holds values that are not finite; collect the transitions again.")
-        if self.terminated is not None and self.terminated.shape != shape:
-            raise ValueError(f"terminated has shape {self.terminated.shape}; expected {shape}.")
+        if self.terminated is not None:
+            flags = np.array(self.terminated)
+            if flags.shape != shape:
+                raise ValueError(f"terminated has shape {flags.shape}; expected {shape}.")
+            if flags.dtype != np.bool_ and not np.isin(flags, (0, 1)).all():
+                raise ValueError(f"terminated must hold True or False, got {flags.dtype}.")
+            object.__setattr__(self, "terminated", flags.astype(np.bool_))
         if self.obs.shape != self.next_obs.shape:
             raise ValueError(f"obs {self.obs.shape} and next_obs {self.next_obs.shape} must have the same shape.")
 

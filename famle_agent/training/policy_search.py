@@ -23,7 +23,9 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from famle_agent.data import gate
 from famle_agent.data.transitions import EnvSource, Transitions
+from famle_agent.data.watch import Watch
 from famle_agent.models.actor_critic import ActorCritic
 
 __all__ = ["PolicySearch", "Search"]
@@ -183,18 +185,30 @@ class Search:
             env.close()
 
 
-class _Told(gym.ObservationWrapper[Any, Any, Any]):
-    """Tells the situation as a one-hot vector behind the observation."""
+class _Told(gym.Wrapper[Any, Any, Any, Any]):
+    """Tells the situation as a one-hot vector behind the observation, and lets nothing in that is no number."""
 
     def __init__(self, env: gym.Env[Any, Any], situation: int, situations: int) -> None:
         super().__init__(env)
+        self._watch = Watch(env)
         self._told = np.eye(situations, dtype=np.float32)[situation]
         size = env.observation_space.shape[0] + situations  # type: ignore[index]
         self.observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
-    def observation(self, observation: Any) -> npt.NDArray[np.float32]:
-        """Appends it."""
-        return np.concatenate([np.asarray(observation, dtype=np.float32), self._told])
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """See :meth:`gymnasium.Env.reset`."""
+        obs, info = gate.reset(self.env, seed=seed, options=options)
+        return self._tell(obs), info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """See :meth:`gymnasium.Env.step`."""
+        resets = self._watch.resets
+        step = gate.step(self.env, action)
+        gate.check_not_reset(self.env, self._watch.resets - resets)
+        return self._tell(step.obs), step.reward, step.terminated, step.truncated, step.info
+
+    def _tell(self, obs: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+        return np.concatenate([obs.astype(np.float32), self._told])
 
 
 class _PartlyUntold(ReplayBuffer):
