@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ def number_within(name: str, value: Any, low: float, high: float, unit: str) -> 
     Raises:
         ValueError: It is none.
     """
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+    number = value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
+    if isinstance(number, (bool, np.bool_)) or not isinstance(number, Real) or not low <= float(number) <= high:
         raise ValueError(f"{name} must be a number between {low:g} and {high:g} {unit}, got {value!r}.")
-    return float(value)
+    return float(number)

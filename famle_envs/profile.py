@@ -60,9 +60,11 @@ class Profile:
                     self, field.name, tuple(number_within(field.name, x, -10.0, 10.0, "rad") for x in value)
                 )
             elif field.name in _FACTORS:
-                number_within(field.name, value, 1e-3, 1e3, "times that of the simulator")
+                number = number_within(field.name, value, 1e-3, 1e3, "times that of the simulator")
+                object.__setattr__(self, field.name, number)
             else:
-                number_within(field.name, value, 0.0, 1e6, "(see the profile's fields for units)")
+                number = number_within(field.name, value, 0.0, 1e6, "(see the profile's fields for units)")
+                object.__setattr__(self, field.name, number)
 
     @property
     def is_simulator(self) -> bool:

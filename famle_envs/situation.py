@@ -226,7 +226,8 @@ def resolve_situation(
     if situation in presets:
         return presets[situation]
     try:
-        return Situation.from_string(situation)
+        # An agent that composes presets writes "a + b".
+        return Situation.from_string(" + ".join(str(presets.get(part, part)) for part in situation.split(" + ")))
     except UnreadableError as error:
         if not presets:
             raise

@@ -11,6 +11,7 @@ from importlib.resources import as_file
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
+import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -40,15 +41,18 @@ from famle_agent.data.envs import (
     SituationEnvs,
     SituationsLike,
     check_spaces,
+    different_arguments,
     env_attribute,
     env_id,
     env_spec,
+    other_reward,
     planning_reward,
+    planning_termination,
     situation_envs,
     special_dims,
 )
 from famle_agent.data.gate import check_action, check_observation, vec_observations, vec_step
-from famle_agent.data.policies import MakePolicy
+from famle_agent.data.policies import MakePolicy, reward_names
 from famle_agent.data.probe import check_reward_fn, check_termination_fn
 from famle_agent.data.transitions import Transitions
 from famle_agent.data.watch import VecWatch
@@ -165,6 +169,12 @@ class ModelBasedAgent(BaseAlgorithm):
         if pretrained and robot.pretrained is not None:
             with as_file(robot.pretrained) as file:
                 self.policy.not_taken = self.take_model(file)
+            if mode == "ours" and self.policy.not_taken and "kind of agent" not in self.policy.not_taken:
+                warnings.warn(
+                    f"The model that is shipped for this robot is not taken: it has another "
+                    f"{', '.join(self.policy.not_taken)}. meta_learn() learns one; pretrained=False asks for none.",
+                    stacklevel=2,
+                )
 
     def _preset(self, overrides: Mapping[str, Any]) -> str:
         """Under which name ``hyperparams/`` has settings that were tuned for this kind of agent; empty for FAMLE."""
@@ -216,11 +226,13 @@ class ModelBasedAgent(BaseAlgorithm):
         self._calls = VecWatch(wrapped).calls
 
     def _take_reward(self, env: VecEnv) -> None:
-        """Looks for what to maximise in an environment, unless the user has said it."""
+        """Looks for what to maximise in an environment, and for where it ends, unless the user has said it."""
         if self.policy.user_reward_fn is None:
-            self.policy.env_reward_fn = planning_reward(env, self.config.planning_reward)
-        self.policy.env_termination_fn = env_attribute(env, "termination_fn", None)
-        if (reward_fn := self.policy.known_reward_fn) is not None:
+            reward_fn, doubtful = planning_reward(env, self.config.planning_reward)
+            self.policy.env_reward_fn, self.policy.doubts_reward_fn = reward_fn, doubtful
+        if self.policy.user_termination_fn is None:
+            self.policy.env_termination_fn = planning_termination(env)
+        if (reward_fn := self.policy.user_reward_fn or self.policy.env_reward_fn) is not None:
             check_reward_fn(reward_fn, self.observation_space, self.action_space, self.device)
         if (termination_fn := self.policy.known_termination_fn) is not None:
             check_termination_fn(termination_fn, self.observation_space, self.device)
@@ -593,6 +605,23 @@ class ModelBasedAgent(BaseAlgorithm):
                 "robot an agent of its own: FAMLE.load(path)."
             )
 
+    def check_task(self, env: gym.Env[Any, Any]) -> None:
+        """Refuses a robot with another task than the agent plans for.
+
+        Raises:
+            ValueError: The robot's reward differs from that of the agent's environment.
+        """
+        known, names = self.policy.known_reward_fn, reward_names(self.config.planning_reward)
+        if known is None or known is self.policy.user_reward_fn:
+            return
+        own = other_reward(env, known, names, self.observation_space, self.action_space)
+        if own is not None:
+            raise ValueError(
+                f"The agent plans for the {own} of its own environment, which gives other rewards than that of the "
+                "environment to be wrapped, because of its goal or of a wrapper: call agent.set_env(env) first, or "
+                "give the agent a reward_fn."
+            )
+
     @property
     def belief(self) -> Belief:
         """What the agent believes of its robots now; of one robot where it has seen none."""
@@ -760,10 +789,11 @@ class ModelBasedAgent(BaseAlgorithm):
         """
         stored = Checkpoint.read(file)
         differing = [] if stored.kind == type(self).__name__ else ["kind of agent"]
-        if self._world(stored.env) != self._world(self._env_spec):
-            differing.append("environment")
+        differing += self._differs(stored.env)
         differing += [name for name, dims in self.dims.items() if stored.dims[name] != dims]
         differing += stored.config.learnt_otherwise(self.config)
+        if not stored.part("reward") and self.env is not None and self.policy.learns_reward:
+            differing.append("reward")
         if not differing:
             self._take_over(stored.model_alone())
         return differing
@@ -786,12 +816,13 @@ class ModelBasedAgent(BaseAlgorithm):
                 f"{error}"
             ) from error
 
-    def _world(self, env: dict[str, Any] | None) -> dict[str, Any] | None:
-        """What of an environment's description matters to a model of all its situations."""
-        if env is None or self.env is None:
-            return None
-        other = env_attribute(self.env, "task_arguments", ())
-        return {"id": env["id"], "kwargs": {key: value for key, value in env["kwargs"].items() if key not in other}}
+    def _differs(self, env: dict[str, Any] | None) -> list[str]:
+        """In what another environment differs from the agent's, as far as it matters to a model of all situations."""
+        if env is None or self._env_spec is None or self.env is None or env["id"] != self._env_spec["id"]:
+            return [] if env is None and self._env_spec is None else ["environment"]
+        task = env_attribute(self.env, "task_arguments", ())
+        names = [name for name in different_arguments(env, self._env_spec) if name not in task]
+        return [f"environment ({', '.join(names)})"] if names else []
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ([] if self.policy.world is None else ["dynamics"]), []

@@ -215,7 +215,7 @@ def begin_model(
     """
     builder, reward, termination = policy.builder, None, None
     obs, action, next_obs = builder.tensors(transitions)
-    if policy.known_reward_fn is None:
+    if policy.learns_reward:
         reward = builder.reward()
         reward.fit(obs, action, next_obs, builder.tensor(transitions.reward), generator)
     if actor_critic is not None and policy.known_termination_fn is None and transitions.ended.any():

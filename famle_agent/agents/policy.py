@@ -36,6 +36,8 @@ class AdaptivePolicy:
         robot: What the robot's observations and actions are; None where no robot is known yet.
         world: What was meta-learned; None before that.
         env_reward_fn: The environment's reward, if it names one.
+        doubts_reward_fn: Whether a wrapper may change what the environment's reward is of, so that it only counts
+            where none was learnt.
         env_termination_fn: The environment's ends of episodes, if it names them.
         not_taken: By what a shipped model differs from what was asked for.
         seed: Seed of the minibatches of an adaptation.
@@ -54,6 +56,7 @@ class AdaptivePolicy:
         self.robot: Interface | None = None
         self.world: WorldModel | None = None
         self.env_reward_fn: RewardFn | None = None
+        self.doubts_reward_fn = False
         self.env_termination_fn: TerminationFn | None = None
         self.not_taken: list[str] = []
         self.seed = 0
@@ -144,8 +147,15 @@ class AdaptivePolicy:
 
     @property
     def known_reward_fn(self) -> RewardFn | None:
-        """The user's reward function, or the environment's; None where it has to be learnt."""
+        """The user's reward function, or the environment's; None where the learnt one counts."""
+        if self.doubts_reward_fn and self.world is not None and self.world.reward is not None:
+            return None
         return self.user_reward_fn or self.env_reward_fn
+
+    @property
+    def learns_reward(self) -> bool:
+        """Whether meta-learning has to learn the reward, since nobody says it of what the agent sees."""
+        return self.user_reward_fn is None and (self.env_reward_fn is None or self.doubts_reward_fn)
 
     @property
     def known_termination_fn(self) -> TerminationFn | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import gymnasium as gym
@@ -12,7 +13,7 @@ from gymnasium.utils import RecordConstructorArgs
 from famle_agent.agents.agent import ModelBasedAgent
 from famle_agent.agents.presets import make_env
 from famle_agent.data import gate
-from famle_agent.data.gate import check_action
+from famle_agent.data.gate import check_action, check_observation
 from famle_agent.data.watch import Watch
 
 __all__ = ["FAMLEWrapper"]
@@ -34,7 +35,7 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
 
     Raises:
         NotLearnedError: The agent has no model yet.
-        ValueError: The environment's spaces are not the agent's.
+        ValueError: The environment's spaces or its task are not the agent's.
     """
 
     def __init__(self, env: gym.Env[Array, Array], agent: ModelBasedAgent) -> None:
@@ -46,6 +47,7 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
                 f"The environment's spaces, {env.observation_space} and {env.action_space}, are not the agent's, "
                 f"{agent.observation_space} and {agent.action_space}."
             )
+        agent.check_task(env)
         self.agent, self._watch = agent, Watch(env)
         self._obs: Array | None = None  # None too where nobody knows where the robot is
         self._begun = False
@@ -54,11 +56,13 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Resets the environment; the agent's plan is void, its memory stays."""
         self._obs = None
-        obs, info = gate.reset(self.env, seed=seed, options=options)
+        obs, info = self.env.reset(seed=seed, options=options)
         self.agent.serve(self)
         self.agent.begin_episode()
         self._begun = True
-        self._know(obs)
+        self._know(None)
+        with suppress(ValueError):  # predict() refuses such a start
+            self._know(check_observation(obs, self.agent.observation_space))
         return obs, info | {"famle": self._belief()}
 
     def step(self, action: Array) -> tuple[Array, Any, bool, bool, dict[str, Any]]:
@@ -90,9 +94,10 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
         self._know(step.obs)
         return step.obs, step.reward, step.terminated, step.truncated, step.info | {"famle": self._belief()}
 
-    def _know(self, obs: Array) -> None:
-        """Notes where the robot is."""
-        self._obs, self._calls, self._resets = obs.copy(), self._watch.calls, self._watch.resets
+    def _know(self, obs: Array | None) -> None:
+        """Notes where the robot is, and that nobody has moved it since."""
+        self._obs = None if obs is None else obs.copy()
+        self._calls, self._resets = self._watch.calls, self._watch.resets
 
     def _belief(self) -> dict[str, Any]:
         posterior, belief = self.agent.posterior(), self.agent.belief

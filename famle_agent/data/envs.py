@@ -2,36 +2,43 @@
 
 from __future__ import annotations
 
+import gc
+import inspect
 import json
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain, count
+from types import FunctionType
 from typing import Any
 
 import gymnasium as gym
 from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec
+from gymnasium.envs.registration import EnvSpec, load_env_creator
 from stable_baselines3.common.vec_env import VecEnv
 
 from famle_agent.data.policies import reward_names
+from famle_agent.data.probe import same_reward
 from famle_agent.data.transitions import EnvSource
-from famle_agent.models.reward import RewardFn
+from famle_agent.data.wrappers import Change, layers, robot_layers, vector_layers
+from famle_agent.models.reward import RewardFn, TerminationFn
 from famle_envs.faults import FaultWrapper, make_faulty
 from famle_envs.profile import Profile
 from famle_envs.situation import Situation
 
 __all__ = [
-    "NEW_OBSERVATIONS",
     "EnvLike",
     "SituationEnvs",
     "SituationsLike",
-    "changing_wrappers",
     "check_spaces",
+    "different_arguments",
     "env_attribute",
     "env_id",
     "env_spec",
+    "other_reward",
     "planning_reward",
+    "planning_termination",
     "situation_envs",
 ]
 
@@ -76,15 +83,6 @@ def env_spec(env: VecEnv) -> dict[str, Any] | None:
     return {"id": spec.id, "kwargs": kwargs, "max_episode_steps": spec.max_episode_steps}
 
 
-NEW_OBSERVATIONS = frozenset(
-    {
-        *("FilterObservation", "FrameStackObservation", "NormalizeObservation", "RescaleObservation"),
-        *("ReshapeObservation", "TimeAwareObservation", "TransformObservation"),
-    }
-)
-"""Gymnasium's wrappers after which an observation means something else; a delayed or noisy one means the same."""
-NEW_ACTIONS = frozenset({"RescaleAction", "TransformAction"})
-"""The same for actions."""
 _ONLOOKERS = frozenset({"Monitor", "RecordEpisodeStatistics", "RecordVideo", "HumanRendering"})
 """Wrappers that change nothing of what a robot and its agent tell each other."""
 _FAULTS = frozenset({FaultWrapper.class_name()})
@@ -92,10 +90,42 @@ _FAULTS = frozenset({FaultWrapper.class_name()})
 
 
 def _plain(value: Any) -> Any:
-    """An argument as JSON types, where it is one of ours."""
+    """An argument as JSON types, where it is one of ours, a number, an array, or made of these."""
     if isinstance(value, Situation):
-        return value.to_dict()
-    return asdict(value) if isinstance(value, Profile) else value
+        return _plain(value.to_dict())
+    if isinstance(value, Profile):
+        return _plain(asdict(value))
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [_plain(item) for item in value]
+    return value.tolist() if hasattr(value, "tolist") else value  # numpy's and torch's numbers and arrays
+
+
+def different_arguments(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """The arguments by which two descriptions of one environment differ; what is not named has its default.
+
+    Args:
+        one: As of :func:`env_spec`.
+        other: The same, with the same id.
+    """
+    spec = gym.registry.get(one["id"])
+    defaults = {} if spec is None else _defaults(spec)
+    first, second = ({**defaults, **described["kwargs"]} for described in (one, other))
+    missing = object()
+    names = first.keys() | second.keys()
+    return sorted(name for name in names if first.get(name, missing) != second.get(name, missing))
+
+
+def _defaults(spec: EnvSpec) -> dict[str, Any]:
+    """The arguments that an environment has where nobody gives any, as JSON types."""
+    try:
+        make = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
+        parameters = inspect.signature(make).parameters.values() if make is not None else ()
+    except (AttributeError, ImportError, TypeError, ValueError):  # of code that says nothing of itself
+        parameters = ()
+    named = {item.name: item.default for item in parameters if item.default is not inspect.Parameter.empty}
+    return {name: _plain(value) for name, value in {**named, **spec.kwargs}.items()}
 
 
 def _plain_spec(env: VecEnv, wrappers: frozenset[str] = _ONLOOKERS) -> EnvSpec | None:
@@ -103,7 +133,7 @@ def _plain_spec(env: VecEnv, wrappers: frozenset[str] = _ONLOOKERS) -> EnvSpec |
     spec: EnvSpec | None = env.get_attr("spec")[0]
     if spec is None or not wrappers.issuperset(wrapper.name for wrapper in spec.additional_wrappers):
         return None
-    return spec
+    return None if any(layer.change for layer in vector_layers(env)) else spec
 
 
 @dataclass(frozen=True)
@@ -142,8 +172,15 @@ def situation_envs(env: VecEnv, envs: SituationsLike | None, episode_length: int
             )
     names, items = _listed(envs)
     sources, labels = [_source(env, item, episode_length) for item in items], list[str]()
+    _check_different(items)
+    there = _all_robots()
     for i, source in enumerate(sources):
         made = source if isinstance(source, gym.Env) else source()
+        if made is not source and id(made.unwrapped) in there:
+            raise ValueError(
+                "A factory returned an environment that was there before. It has to make a new one at each call, which "
+                "is closed after use: put the environment itself into the list, or make it in the function."
+            )
         try:
             _check_same_spaces(made, env)
             _check_simulated(made)
@@ -157,6 +194,35 @@ def situation_envs(env: VecEnv, envs: SituationsLike | None, episode_length: int
         labels.append(names[i] if names else next(name for name in own_names if name not in labels))
         _check_name(labels[-1])
     return SituationEnvs(sources, labels)
+
+
+def _check_different(items: Sequence[EnvLike]) -> None:
+    """Refuses one environment, or one function that was written for several, in the place of two situations."""
+    robots = [item.unwrapped for item in items if isinstance(item, gym.Env)]
+    if len({id(robot) for robot in robots}) < len(robots):
+        raise ValueError(
+            "The list of environments holds the same one twice, which has one situation at a time: make one for each."
+        )
+    functions = list({id(item): item for item in items if isinstance(item, FunctionType)}.values())
+    for i, function in enumerate(functions):
+        for other in functions[:i]:
+            if _says(function) == _says(other):
+                raise ValueError(
+                    f"Two factories, {function.__qualname__}, do the same: a function that is made in a loop sees the "
+                    "loop's last value when it is called. Bind the value: lambda situation=situation: ..."
+                )
+
+
+def _says(function: FunctionType) -> tuple[Any, ...]:
+    """What decides what a function returns, but for the rest of the world."""
+    cells = [id(cell) for cell in function.__closure__ or ()]
+    bound = [function.__defaults__ or (), tuple(sorted((function.__kwdefaults__ or {}).items()))]
+    return function.__code__, cells, [id(value) for values in bound for value in values]
+
+
+def _all_robots() -> dict[int, gym.Env[Any, Any]]:
+    """All environments of this process, which belong to whoever made them, by identity."""
+    return {id(item): item for item in gc.get_objects() if issubclass(type(item), gym.Env)}
 
 
 def _listed(envs: SituationsLike) -> tuple[list[str], list[EnvLike]]:
@@ -241,12 +307,16 @@ def _check_time_limit(made: gym.Env[Any, Any], episode_length: int) -> None:
         )
 
 
-def planning_reward(env: VecEnv, name: str) -> RewardFn | None:
+def planning_reward(env: VecEnv, name: str) -> tuple[RewardFn | None, bool]:
     """What a planner should maximise in an environment, where it says that.
 
     Args:
         env: The environment.
         name: What it calls it; empty takes the first of :data:`~famle_agent.data.policies.REWARDS` that it has.
+
+    Returns:
+        The function, and whether it is in doubt that it speaks of what the agent sees and does. None where there is
+        none, or where a wrapper gives other rewards.
 
     Raises:
         ValueError: It has nothing of that name; or it has, but a wrapper changes what it would be given, or the robots
@@ -256,40 +326,90 @@ def planning_reward(env: VecEnv, name: str) -> RewardFn | None:
         raise ValueError(f"The environment has no {name!r}; planning_reward must name a function of it, or be empty.")
     known = [reward for reward in reward_names(name) if env.has_attr(reward)]
     if not known:
-        return None
-    if changed := changing_wrappers(env):
-        raise ValueError(
-            f"The environment's {known[0]} is of what {', '.join(changed)} changes; give the reward of the wrapped "
-            "observations and actions (reward_fn=...), or the environment without that wrapper."
-        )
+        return None, False
+    changed, doubtful = _changed(env, known[0], "reward_fn", Change.OBSERVATION | Change.ACTION | Change.REWARD)
+    if changed and not name:
+        return None, False
     if len(tasks := sorted(set(_tasks(env)))) > 1:
         raise ValueError(
             f"The robots of this VecEnv have different tasks ({'; '.join(tasks)}), and an agent plans for one. "
             "Give a reward_fn that finds the task in the observation, or each task an agent of its own."
         )
     reward_fn: RewardFn = env_attribute(env, known[0], None)
-    return reward_fn
+    return reward_fn, doubtful and not name
 
 
-def changing_wrappers(env: VecEnv, changed: frozenset[str] = NEW_OBSERVATIONS | NEW_ACTIONS) -> list[str]:
-    """Names of the wrappers between an environment and its agent that change the meaning of what passes.
+def other_reward(
+    env: gym.Env[Any, Any],
+    reward_fn: RewardFn,
+    names: Sequence[str],
+    observation_space: spaces.Box,
+    action_space: spaces.Box,
+) -> str | None:
+    """Names the function by which an environment rewards otherwise than a function does.
 
     Args:
-        env: The environment. Where it is not registered, its wrappers are not known.
-        changed: Wrappers of Gymnasium that count. One of a ``VecEnv`` that changes the shape of observations does too.
+        env: The environment.
+        reward_fn: What it is compared with.
+        names: What the environment may call its own; the first that it has counts.
+        observation_space: Of both.
+        action_space: Of both.
+
+    Returns:
+        The name; None where they agree, or where the environment says nothing of what passes its wrappers.
     """
-    spec: EnvSpec | None = env.get_attr("spec")[0]
-    found = [] if spec is None else [item.name for item in spec.additional_wrappers if item.name in changed]
-    if env.observation_space.shape != env_attribute(env, "observation_space", env.observation_space).shape:
-        found.append(type(env).__name__)
-    return found
+    name = next((name for name in names if env.has_wrapper_attr(name)), None)
+    if name is None:
+        return None
+    if robot_layers(env, name) or same_reward(env.get_wrapper_attr(name), reward_fn, observation_space, action_space):
+        return None
+    return name
+
+
+def planning_termination(env: VecEnv) -> TerminationFn | None:
+    """Where episodes end, if an environment says that of what the agent sees.
+
+    Raises:
+        ValueError: A wrapper changes the observations that it speaks of.
+    """
+    name = "termination_fn"
+    if not env.has_attr(name) or any(_changed(env, name, name, Change.OBSERVATION)):
+        return None
+    termination_fn: TerminationFn = env_attribute(env, name, None)
+    return termination_fn
+
+
+def _changed(env: VecEnv, name: str, argument: str, matters: Change) -> tuple[bool, bool]:
+    """Whether wrappers give other rewards than a function of an environment, and whether they may change anything.
+
+    Raises:
+        ValueError: A wrapper certainly changes what the function would be given.
+    """
+    between = [layer for layer in layers(env, name) if layer.change & matters]
+    given = [layer.name for layer in between if layer.is_known and layer.change & ~Change.REWARD]
+    if given:
+        raise ValueError(
+            f"The environment's {name} is of what {', '.join(given)} changes; give the one of the wrapped observations "
+            f"and actions ({argument}=...), or the environment without that wrapper."
+        )
+    if doubtful := [layer.name for layer in between if not layer.is_known]:
+        warnings.warn(
+            f"{', '.join(doubtful)} may change what the environment's {name} is of: who meta-learns takes what happens "
+            f"in simulation instead. Where it changes nothing, say {argument}=env.get_wrapper_attr({name!r}).",
+            stacklevel=5,
+        )
+    return any(layer.is_known for layer in between), bool(doubtful)
 
 
 def _tasks(env: VecEnv) -> list[str]:
     """What each robot of a ``VecEnv`` should do, as far as the arguments of its environment say that."""
     specs: list[EnvSpec | None] = env.get_attr("spec")
-    asked = [{} if spec is None else {k: v for k, v in spec.kwargs.items() if k not in _NO_TASK} for spec in specs]
-    return [json.dumps(kwargs, default=repr, sort_keys=True) for kwargs in asked]
+    asked = [{} if spec is None else {**_defaults(spec), **_plain(spec.kwargs)} for spec in specs]
+    tasks = [{key: value for key, value in kwargs.items() if key not in _NO_TASK} for kwargs in asked]
+    differing = {key for task in tasks for key in task if any(task.get(key) != other.get(key) for other in tasks)}
+    return [
+        json.dumps({key: task[key] for key in task if key in differing}, default=repr, sort_keys=True) for task in tasks
+    ]
 
 
 _NO_TASK = frozenset({"situation", "profile", "engine", "render_mode"})
@@ -324,10 +444,10 @@ def special_dims(
         known |= {"pose_dims": (), "angle_dims": known["angle_dims"] + (heading if len(heading) == 1 else ())}
     if raw_angles:
         known |= {"angle_dims": ()}
-    inherited = [name for name, chosen in given.items() if chosen is None and known[name]]
-    if inherited and (changed := changing_wrappers(env, NEW_OBSERVATIONS)):
-        raise ValueError(
-            f"The environment's {', '.join(inherited)} are of what {', '.join(changed)} changes; give those of the "
-            f"wrapped observations ({inherited[0]}=..., or () for none), or the environment without that wrapper."
-        )
+    for name in (name for name, chosen in given.items() if chosen is None and known[name]):
+        if changed := [layer.name for layer in layers(env, name) if layer.change & Change.OBSERVATION]:
+            raise ValueError(
+                f"The environment's {name} are of what {', '.join(changed)} changes, or may change; give those of the "
+                f"wrapped observations ({name}=..., or () for none), or the environment without that wrapper."
+            )
     return {name: known[name] if chosen is None else tuple(chosen) for name, chosen in given.items()}

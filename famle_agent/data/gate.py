@@ -140,7 +140,9 @@ def _of_space(name: str, values: Any, space: spaces.Box) -> Array:
 def _numeric(values: Any) -> Array:
     """The values as an array, unless a conversion to float would make numbers of what are none."""
     array = np.asarray(values)
-    if array.dtype.kind not in "biufO":
+    if array.dtype.kind == "O":
+        array = np.array([float(value) for value in array.ravel()]).reshape(array.shape)
+    if array.dtype.kind not in "biuf":
         raise TypeError(f"values of dtype {array.dtype}")
     return array
 

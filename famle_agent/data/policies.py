@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from famle_agent.data.action_scaling import ActionScale, to_action_space
+from famle_agent.data.wrappers import robot_layers
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.reward import Objective, RewardFn, TerminationFn
 from famle_agent.models.simulator import Simulator
@@ -45,6 +46,24 @@ REWARDS = ("planning_reward_fn", "reward_fn")
 def reward_names(named: str) -> tuple[str, ...]:
     """What to ask an environment for: the function that was named, else the first of :data:`REWARDS` that it has."""
     return (named,) if named else REWARDS
+
+
+def _reward_of(env: gym.Env[Any, Any], names: Sequence[str]) -> RewardFn:
+    """The first function of these names that an environment has.
+
+    Raises:
+        ValueError: It has none, or a wrapper changes what it is of.
+    """
+    name = next((name for name in names if env.has_wrapper_attr(name)), None)
+    changed = [] if name is None else [layer.name for layer in robot_layers(env, name)]
+    if name is None or changed:
+        why = f"is of what {', '.join(changed)} changes" if changed else "is missing"
+        raise ValueError(
+            f"The {name or ' or '.join(names)} of the simulated environment {env} {why}, and planning there needs it: "
+            "give the agent a reward_fn."
+        )
+    reward_fn: RewardFn = env.get_wrapper_attr(name)
+    return reward_fn
 
 
 MakePolicy = Callable[[gym.Env[Any, Any], int, np.random.Generator], Policy]
@@ -138,8 +157,7 @@ class make_planning:  # noqa: N801
     def __call__(self, env: gym.Env[Any, Any], situation: int, rng: np.random.Generator) -> Policy:
         """See :data:`MakePolicy`."""
         scale = ActionScale.of(env.action_space, torch.device("cpu"))  # type: ignore[arg-type]
-        own = (env.get_wrapper_attr(name) for name in self.rewards if env.has_wrapper_attr(name))
-        in_env_units: RewardFn = self.reward_fn or next(own)
+        in_env_units: RewardFn = self.reward_fn or _reward_of(env, self.rewards)
 
         def reward_fn(obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
             return in_env_units(obs, scale.from_unit(action), next_obs)

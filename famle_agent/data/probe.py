@@ -34,10 +34,11 @@ def same_reward(
     one: Callable[..., Any], other: Callable[..., Any], observation_space: spaces.Box, action_space: spaces.Box
 ) -> bool:
     """Says whether two reward functions agree on a batch, so that they are of the same task."""
-    one_, other_ = (
-        torch.as_tensor(reward_fn(*_transitions(observation_space, action_space, "cpu"))) for reward_fn in (one, other)
-    )
-    return bool(torch.allclose(one_.float(), other_.float(), equal_nan=True))
+    rewards = [
+        torch.as_tensor(reward_fn(*_transitions(observation_space, action_space, "cpu"))).float()
+        for reward_fn in (one, other)
+    ]
+    return bool(torch.allclose(rewards[0], rewards[1], equal_nan=True))
 
 
 def _try(name: str, function: Any, arguments: str, given: tuple[Tensor, ...]) -> None:

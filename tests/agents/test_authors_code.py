@@ -76,7 +76,7 @@ def load(file: Path) -> Iterator[Load]:
         agent.get_env().close()
 
 
-def counted(agent: FAMLE, door: str, episodes: int) -> list[int]:
+def counted(agent: FAMLE, door: str, episodes: int, **robot: Any) -> list[int]:
     """How often the agent has adapted when it plans each action, however it is told what happens."""
     counts: list[int] = []
     kind = type(agent.adapter)
@@ -92,13 +92,13 @@ def counted(agent: FAMLE, door: str, episodes: int) -> list[int]:
         elif door == "state":
             evaluate_policy(agent, agent.get_env(), n_eval_episodes=episodes, warn=False)
         else:
-            wrapped(agent, episodes)
+            wrapped(agent, episodes, **robot)
     return counts
 
 
-def wrapped(agent: FAMLE, episodes: int) -> list[int]:
+def wrapped(agent: FAMLE, episodes: int, **robot: Any) -> list[int]:
     """How often the agent has adapted after each reset and each step of some episodes."""
-    env, counts = FAMLEWrapper(make_robot(), agent), []
+    env, counts = FAMLEWrapper(make_robot(**robot), agent), []
     for episode in range(episodes):
         obs, info = env.reset(seed=episode)
         counts.append(info["famle"]["adaptations"])
@@ -300,9 +300,9 @@ def test_plans_for_the_square_of_the_distance(
     elif origin == "another robot":
         agent.get_env().close()
         agent.set_env(Monitor(make_robot(goal=(0.5, 0.5))))
-    counted(agent, door, episodes=1)
-    assert set(asked) == {"squared_reward_fn"}
     goal = (0.5, 0.5) if origin == "another robot" else (-1.0, 1.0)
+    counted(agent, door, episodes=1, goal=goal)
+    assert set(asked) == {"squared_reward_fn"}
     obs, action, next_obs = (torch.from_numpy(values[0]) for values in (data.obs, data.action, data.next_obs))
     expected = torch.exp(-(next_obs[:, 10:] - torch.tensor(goal)).square().sum(dim=-1))
     torch.testing.assert_close(agent.policy.unit_reward_fn()(obs, action, next_obs), expected)

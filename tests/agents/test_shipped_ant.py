@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -7,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from famle_agent import FAMLE, FAMLEWrapper
+from famle_agent import AMPC, FAMLE, FAMLEWrapper
 from famle_agent.agents.presets import known_robots
 from famle_agent.rollout import rollout
 
@@ -19,6 +20,20 @@ def agent() -> Any:
     agent = FAMLE("ant", seed=0, device="cpu")
     yield agent
     agent.get_env().close()
+
+
+def test_robot_reads_what_the_agent_believes(agent: FAMLE, make_env: MakeEnv) -> None:
+    env = make_env("FamleAnt-v0")
+    for name in agent.posterior():
+        parts = name.split(" + ")
+        yaw_errors = sum("yaw" in part for part in parts)
+        if yaw_errors == 2:  # which no robot has
+            with pytest.raises(ValueError, match="contradicts"):
+                env.get_wrapper_attr("set_situation")(name)
+        else:
+            env.get_wrapper_attr("set_situation")(name)
+            text = str(env.get_wrapper_attr("situation"))
+            assert all(str(env.get_wrapper_attr("presets")[part]) in text for part in parts)
 
 
 def test_package_ships_a_model_of_these_settings(agent: FAMLE) -> None:
@@ -42,7 +57,32 @@ def test_other_settings_begin_without_a_model(settings: dict[str, Any]) -> None:
 
 
 def test_another_control_rate_is_another_world(make_env: MakeEnv) -> None:
-    assert FAMLE(make_env("FamleAnt-v0", control_rate=100), device="cpu").dynamics is None
+    with pytest.warns(UserWarning, match=r"not taken: it has another environment \(control_rate\)\. meta_learn"):
+        assert FAMLE(make_env("FamleAnt-v0", control_rate=100), device="cpu").dynamics is None
+
+
+@pytest.mark.filterwarnings("error:.*not taken")
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"control_rate": 60.6},
+        {"control_rate": np.float64(60.6), "yaw_sensor": "offset"},
+        {"situation": "joint 0 dead", "terminate_when_fallen": np.bool_(True)},
+    ],
+)
+def test_default_that_is_said_is_the_same_world(make_env: MakeEnv, arguments: Any) -> None:
+    assert FAMLE(make_env("FamleAnt-v0", **arguments), device="cpu").dynamics is not None
+
+
+def test_what_refused_the_shipped_model_is_said_once() -> None:
+    with pytest.warns(UserWarning, match="another hidden, members") as said:
+        FAMLE("ant", device="cpu", hidden=(8,), members=2)
+    assert len(said) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert FAMLE("ant", device="cpu", hidden=(8,), pretrained=False).dynamics is None
+        assert FAMLE("ant", "paper", device="cpu").dynamics is None
+        AMPC("ant", device="cpu")
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -271,6 +272,51 @@ def test_environments_made_for_the_situations_are_closed(make_env: MakeEnv) -> N
     for env in made:
         with pytest.raises(RuntimeError, match="closed"):
             env.unwrapped.reset()
+
+
+def test_environment_of_the_user_stays_open(make_env: MakeEnv) -> None:
+    agent = FAMLE(make_env(), seed=0, device="cpu", transitions_per_situation=2)
+    own, listed = make_env(), [make_env()]
+
+    def takes(env: gym.Env[Any, Any] = own) -> gym.Env[Any, Any]:
+        return env
+
+    for factory in (lambda: own, takes, lambda: listed[0], lambda: gym.wrappers.TimeLimit(own, 3), partial(takes, own)):
+        with pytest.raises(ValueError, match="environment that was there before"):
+            agent.collect([factory])
+    for env in (own, *listed):
+        env.reset()
+
+
+def test_one_environment_has_one_situation(make_env: MakeEnv) -> None:
+    agent, env = FAMLE(make_env(), seed=0, device="cpu", transitions_per_situation=2), make_env()
+    same: list[Any] = [[env, env], [env, gym.wrappers.TimeLimit(env, 3)], {"a": env, "b": env.unwrapped}]
+    for envs in same:
+        with pytest.raises(ValueError, match="holds the same one twice"):
+            agent.collect(envs)
+    env.reset()
+
+
+def test_factories_that_are_bound_too_late_are_one(make_env: MakeEnv) -> None:
+    agent = FAMLE(make_env(), seed=0, device="cpu", transitions_per_situation=2)
+    names, late = ("intact", "joint 0 dead"), list[Any]()
+    for name in names:
+        late.append(lambda: gym.make("FamleReacher-v0", situation=name))  # noqa: B023 (the mistake in question)
+    with pytest.raises(ValueError, match=r"do the same.*lambda situation=situation"):
+        agent.collect(late)
+    with pytest.raises(ValueError, match="do the same"):
+        agent.collect([lambda: gym.make("FamleReacher-v0", situation=name) for name in names])
+
+    def bound(name: str) -> Callable[[], gym.Env[Any, Any]]:
+        return lambda: gym.make("FamleReacher-v0", situation=name)
+
+    early = [lambda name=name: gym.make("FamleReacher-v0", situation=name) for name in names]
+    for envs in (
+        early,
+        [bound(name) for name in names],
+        [partial(gym.make, "FamleReacher-v0", situation=n) for n in names],
+    ):
+        assert agent.collect(envs).situations == names
 
 
 def test_environments_with_other_spaces_are_closed(make_env: MakeEnv) -> None:

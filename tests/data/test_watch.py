@@ -116,10 +116,11 @@ def test_environment_that_resets_itself_within_a_step(agent: FAMLE, tells: str) 
 def test_plan_is_void_where_the_robot_was_reset(agent: FAMLE) -> None:
     env = FAMLEWrapper(gym.wrappers.Autoreset(Counter(2)), agent)
     obs, _ = env.reset()
-    for _ in range(3):
-        agent.predict(obs)
-        assert agent._live is None or agent._live.plan.any()
+    for _ in range(2):
         obs, *_ = env.step(NOTHING)
+    agent.predict(obs)
+    assert agent.state_of(1).plan.any()
+    env.step(NOTHING)
     assert not agent.state_of(1).plan.any()
 
 

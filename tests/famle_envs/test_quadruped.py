@@ -209,6 +209,15 @@ def test_training_situations_are_intact_each_joint_blocked_and_yaw_errors() -> N
     assert all(s.faults == {"orientation_error"} for s in situations[13:])
 
 
+def test_presets_may_be_composed(make: Make) -> None:
+    env = make(situation="front left leg blocked + yaw sensor off by 45 deg + joint 0 locked")
+    assert env.situation.locked_joints == (0, 3, 4, 5)
+    assert env.situation.orientation_error == pytest.approx(math.radians(45))
+    for wrong in ("front left leg blocked + no such thing", "paper + yaw sensor off by 45 deg"):
+        with pytest.raises(ValueError, match=r"No situation is called|contradicts"):
+            env.set_situation(wrong)
+
+
 def test_presets_are_known_by_name(make: Make) -> None:
     env = make()
     names = {s.name for s in QuadrupedEnv.training_situations} | {f"{leg} leg blocked" for leg in LEGS}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from fractions import Fraction
 from typing import Any
 
 import gymnasium as gym
@@ -19,6 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from famle_envs import Situation
 from famle_envs.ant import AntEnv
+from famle_envs.profile import Profile
 from famle_envs.reacher import ReacherEnv
 from famle_envs.robot_env import RobotEnv
 
@@ -117,3 +119,31 @@ def test_ppo_learns_on_it_for_two_rollouts(env_id: str) -> None:
     assert model.num_timesteps == 64
     assert not torch.equal(model.policy.action_net.weight, before)
     vec_env.close()
+
+
+# --- numbers ------------------------------------------------------------------------------------------------
+
+
+NUMBERS = [100, 100.0, np.int64(100), np.float32(100), np.array(100.0), Fraction(100), np.uint8(100)]
+
+
+@pytest.mark.parametrize("rate", NUMBERS, ids=lambda value: type(value).__name__)
+def test_numbers_are_numbers(rate: Any) -> None:
+    env = gym.make("FamleAnt-v0", control_rate=rate)
+    assert env.get_wrapper_attr("control_period") == pytest.approx(0.01)
+    env.close()
+    assert type(Profile("heavy", base_mass=rate, latency=rate).base_mass) is float
+    assert Profile(base_mass=rate) == Profile(base_mass=100.0)
+
+
+@pytest.mark.parametrize("rate", ["100", True, np.bool_(True), None, np.nan, [100.0], np.array([100.0, 1.0]), 1e9])
+def test_what_is_no_rate_is_refused(rate: Any) -> None:
+    with pytest.raises(ValueError, match="control_rate must be a number between"):
+        gym.make("FamleAnt-v0", control_rate=rate)
+
+
+@pytest.mark.parametrize("kind", [list, tuple, np.array, lambda goal: np.array(goal, np.float32)])
+def test_goals_are_points(kind: Any) -> None:
+    env = gym.make("FamleQuadruped-v0", goal=kind([1.5, -1.0]))
+    assert env.get_wrapper_attr("goal") == (1.5, -1.0)
+    env.close()
