@@ -57,7 +57,7 @@ class RandomShooting(Planner):
     ) -> tuple[Tensor, Tensor]:
         """See :meth:`Planner.plan`."""
         shape = (len(start), self.candidates, *start.shape[1:])
-        tau = torch.rand(shape, generator=generator, device=start.device) * 2.0 - 1.0
+        tau = torch.rand(shape, generator=generator, device=start.device, dtype=start.dtype) * 2.0 - 1.0
         tau = tau if proposals is None else torch.cat([tau, proposals], dim=1)
         best = _take(tau, judge(tau).argmax(dim=1, keepdim=True))[:, 0]
         return best[:, 0], best
@@ -136,7 +136,8 @@ class MPPI(Planner):
             returns = judge(tau)
             best = returns.amax(dim=1, keepdim=True)
             finite = torch.where(returns.isfinite(), returns, best).nan_to_num(neginf=0.0)
-            scale = (self.temperature * finite.std(dim=1, keepdim=True)).clamp(min=1e-8)
+            scale = self.temperature * finite.std(dim=1, keepdim=True)
+            scale = torch.where(scale > 0.0, scale, 1.0)  # where all are alike, none is better
             # Where no candidate stayed among the finite numbers, none is better than another.
             advantage = torch.where(best.isfinite(), returns - best, 0.0)
             mean = torch.einsum("bn,bnha->bha", torch.softmax(advantage / scale, dim=1), tau)
@@ -160,12 +161,12 @@ def coloured_noise(like: Tensor, n: int, beta: float, generator: torch.Generator
     """
     size, horizon, action_dim = like.shape
     if horizon == 1 or beta == 0.0:
-        return torch.randn(size, n, horizon, action_dim, generator=generator, device=like.device)
-    frequency = torch.fft.rfftfreq(horizon, device=like.device)
+        return torch.randn(size, n, horizon, action_dim, generator=generator, device=like.device, dtype=like.dtype)
+    frequency = torch.fft.rfftfreq(horizon, device=like.device, dtype=like.dtype)
     frequency[0] = frequency[1]
     scale = frequency ** (-beta / 2.0)
     shape = (2, size, n, action_dim, len(scale))
-    real, imaginary = torch.randn(shape, generator=generator, device=like.device) * scale
+    real, imaginary = torch.randn(shape, generator=generator, device=like.device, dtype=like.dtype) * scale
     imaginary[..., 0] = 0.0  # a constant has no phase
     real[..., 0] *= math.sqrt(2.0)
     power = 2.0 * scale[1:].square().sum() * 2.0 + 2.0 * scale[0].square()

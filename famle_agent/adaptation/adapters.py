@@ -134,11 +134,11 @@ class GradientAdapter:
 
     def initial(self, robots: int) -> Belief:
         """Returns theta_meta. See :class:`~famle_agent.adaptation.controller.Adapter`, here and below."""
-        return unadapted(self.model, torch.zeros(1, device=self.model.embeddings.device), robots)
+        return unadapted(self.model, self.model.embeddings.new_zeros(1), robots)
 
     def judge(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> Evidence:
         """Returns zeros: there is one model, and nothing to tell apart."""
-        nothing = torch.zeros(len(obs), device=obs.device)
+        nothing = obs.new_zeros(len(obs))
         return Evidence(nothing[:, None], nothing, torch.ones_like(obs))
 
     def infer(self, memory: Memory, belief: Belief, evidence: Evidence, moved: Tensor) -> Belief:

@@ -135,7 +135,7 @@ class Controller:
     def init(self, belief: Belief, memory: Memory) -> OnlineState:
         """Returns the state of B robots that believe what the adapter says, with an empty memory (line 1)."""
         robots, _, action_dim = memory.action.shape
-        plan = torch.zeros(robots, self.planner.horizon, action_dim, device=memory.action.device)
+        plan = memory.action.new_zeros(robots, self.planner.horizon, action_dim)
         return OnlineState(memory, belief, plan)
 
     def observe(self, state: OnlineState, obs: Tensor, starts: Tensor) -> OnlineState:

@@ -49,14 +49,15 @@ class Memory:
     ) -> Memory:
         """A memory of ``size`` M for B robots that have seen nothing; W is ``window``, None for M."""
         window = size if window is None else min(window, size)
-        obs, action = (torch.zeros(robots, size, dim, device=device) for dim in (obs_dim, action_dim))
-        log_p = torch.zeros(robots, window, candidates, device=device)
+        like = torch.zeros((), device=device, dtype=torch.float32)
+        obs, action = (like.new_zeros(robots, size, dim) for dim in (obs_dim, action_dim))
+        log_p = like.new_zeros(robots, window, candidates)
         return cls(obs, action, obs, log_p, log_p.new_zeros(robots, window), obs.new_zeros(robots, size))
 
     @classmethod
     def full(cls, obs: Tensor, action: Tensor, next_obs: Tensor, log_p: Tensor) -> Memory:
         """A memory of M transitions of each robot, of which nobody knows what the robot believed then."""
-        weight = torch.ones(obs.shape[:2], device=obs.device)
+        weight = obs.new_ones(obs.shape[:2])
         return cls(obs, action, next_obs, log_p, torch.zeros_like(weight), weight)
 
     @property
@@ -173,7 +174,8 @@ def minibatches(size: int, generator: torch.Generator) -> Sample:
 
         def draw() -> Batch:
             shape = (robots, model.members, size)
-            chance = torch.rand(shape, generator=generator, device=generator.device).to(memory.weight.device)
+            chance = torch.rand(shape, generator=generator, device=generator.device, dtype=torch.float32)
+            chance = chance.to(memory.weight.device)
             nth = (chance * running_number[:, -1:, None]).floor()
             # Of the transitions that count, the nth is where their running number passes n.
             i = torch.searchsorted(running_number, nth.flatten(1), right=True).clamp(max=M - 1).view(shape)

@@ -60,6 +60,7 @@ from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import prepare_torch
 from famle_agent.models.reward import RewardFn, TerminationFn
 from famle_agent.training.run_folder import RunFolder
+from famle_agent.utils.chance import alone
 
 __all__ = ["ModelBasedAgent"]
 
@@ -119,6 +120,7 @@ class ModelBasedAgent(BaseAlgorithm):
     last_check: Check | None
     _live: OnlineState | None
 
+    @torch.inference_mode(mode=False)
     def __init__(
         self,
         env: GymEnv | str | None,
@@ -207,10 +209,12 @@ class ModelBasedAgent(BaseAlgorithm):
         """Seeds the environment, the meta-learning and the planner; None changes nothing."""
         if seed is None:
             return
-        super().set_random_seed(seed)
+        with alone():
+            super().set_random_seed(seed)
         self.seed = self.policy.seed = seed
         self.generator.manual_seed(seed)
 
+    @torch.inference_mode(mode=False)
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Gives the agent another environment with the same spaces and any number of robots.
 
@@ -301,6 +305,7 @@ class ModelBasedAgent(BaseAlgorithm):
 
     # --- learning in simulation -------------------------------------------------------------------------
 
+    @torch.inference_mode(mode=False)
     def meta_learn(
         self,
         envs: SituationsLike | Transitions | None = None,
@@ -390,6 +395,7 @@ class ModelBasedAgent(BaseAlgorithm):
                 stacklevel=3,
             )
 
+    @torch.inference_mode(mode=False)
     def collect(self, envs: SituationsLike | None = None, progress_bar: bool = False, n_jobs: int = 1) -> Transitions:
         """Collects random transitions in every situation; arguments as of :meth:`meta_learn`.
 
@@ -424,6 +430,7 @@ class ModelBasedAgent(BaseAlgorithm):
 
     # --- living on a robot ------------------------------------------------------------------------------
 
+    @torch.inference_mode(mode=False)
     def learn(
         self,
         total_timesteps: int,
@@ -499,6 +506,7 @@ class ModelBasedAgent(BaseAlgorithm):
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
 
+    @torch.inference_mode(mode=False)
     def predict(  # type: ignore[override]
         self,
         observation: Array | dict[str, Array],
@@ -560,6 +568,7 @@ class ModelBasedAgent(BaseAlgorithm):
         actions = to_action_space(action, self.action_space)
         return (actions[0] if numbers.ndim == 1 else actions), state
 
+    @torch.inference_mode(mode=False)
     def observe(self, obs: Array, action: Array, next_obs: Array) -> None:
         """Tells the agent of a transition of its robot; every K transitions it adapts.
 
@@ -581,6 +590,7 @@ class ModelBasedAgent(BaseAlgorithm):
         moved = torch.zeros(len(s), dtype=torch.bool, device=self.device)
         self._live = self._observed(controller.observe(state, s_next, moved))
 
+    @torch.inference_mode(mode=False)
     def begin_episode(self) -> None:
         """Tells the agent that its robot was reset: its plan is void, its memory stays."""
         if self._live is not None:
@@ -627,6 +637,7 @@ class ModelBasedAgent(BaseAlgorithm):
         """What the agent believes of its robots now; of one robot where it has seen none."""
         return (self._live or self.state_of(self.model.robots)).belief
 
+    @torch.inference_mode(mode=False)
     def posterior(self, state: OnlineState | None = None) -> dict[str, float]:
         """P(situation | memory) by name, of the first robot; of what the agent believes now, or of a state.
 
@@ -635,6 +646,7 @@ class ModelBasedAgent(BaseAlgorithm):
         """
         return self.adapter.posterior(self.belief if state is None else state.belief, self.situations)
 
+    @torch.inference_mode(mode=False)
     def marginals(self, state: OnlineState | None = None) -> dict[str, float]:
         """As :meth:`posterior`, but of each training situation, be it alone or a part of what is wrong."""
         return self.adapter.marginals(self.belief if state is None else state.belief, self.situations)
@@ -670,6 +682,7 @@ class ModelBasedAgent(BaseAlgorithm):
             )
         return state
 
+    @torch.inference_mode(mode=False)
     def state_of(self, robots: int) -> OnlineState:
         """Returns what the agent believes now where that fits the number of robots, else what it meta-learned.
 
@@ -721,6 +734,7 @@ class ModelBasedAgent(BaseAlgorithm):
         ).write(path)
 
     @classmethod
+    @torch.inference_mode(mode=False)
     def load(  # type: ignore[override]
         cls,
         path: File,
@@ -766,6 +780,7 @@ class ModelBasedAgent(BaseAlgorithm):
         agent.set_random_seed(overrides.get("seed"))
         return agent
 
+    @torch.inference_mode(mode=False)
     def restore(self, file: File) -> None:
         """Takes weights, belief and random numbers from the file of an agent with the same settings.
 
@@ -778,6 +793,7 @@ class ModelBasedAgent(BaseAlgorithm):
         """
         self._take_over(Checkpoint.read(file))
 
+    @torch.inference_mode(mode=False)
     def take_model(self, file: File) -> list[str]:
         """Takes the model from a file, if that is of the same kind, environment and settings of learning.
 

@@ -5,6 +5,7 @@ One round is the paper's: random actions, then Algorithm 1.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Generator
 from copy import deepcopy
 from dataclasses import replace
@@ -25,11 +26,13 @@ from famle_agent.data.policies import MakePolicy, make_held_uniform, make_planni
 from famle_agent.data.transitions import Transitions
 from famle_agent.models.actor_critic import ActorCritic
 from famle_agent.models.dynamics import Batch, Dynamics
+from famle_agent.models.scale import unresolved
 from famle_agent.training.policy_search import PolicySearch, Search
 from famle_agent.training.progress import Progress
 from famle_agent.training.run_folder import RunFolder
 from famle_agent.training.trainer import Metrics
 from famle_agent.utils.atomic_write import whole_file
+from famle_agent.utils.chance import GlobalChance
 
 __all__ = ["Learner", "begin_model", "meta_train", "planning_policy", "search_policy", "simulate"]
 
@@ -89,6 +92,8 @@ def meta_train(
             with bar("Simulating", number, config.simulation.transitions(number) * len(new.sources), "step") as shown:
                 new = simulate(agent, new, number, n_jobs, folder.transitions(number), shown.update)
         reports = agent.num_iterations if number == 0 else reports
+        if number == 0:
+            _warn_of_resolution(new)
         new = policy.builder.in_model_units(new)
         transitions = new if transitions is None else transitions.followed_by(new)
         if (stored := folder.finished(number)) is not None:
@@ -98,10 +103,10 @@ def meta_train(
 
         # Lines 7 to 14: theta and H from them.
         left = reports + config.iterations(number, number == last) - agent.num_iterations
-        with bar("Meta-learning", number, left, "it") as shown, torch.random.fork_rng(devices=[]):
-            torch.manual_seed(agent.draw_seed())  # initial weights come from torch's global generator
+        with bar("Meta-learning", number, left, "it") as shown:
             anew = config.begins_anew(number, number == last)
-            model, data = begin_model(policy, transitions, anew, agent.generator, actor_critic)
+            with GlobalChance(agent.draw_seed())():  # initial weights come from torch's global generator
+                model, data = begin_model(policy, transitions, anew, agent.generator, actor_critic)
             progress = partial(_progress, agent, folder, number, shown)
             for metrics in config.trainer(number, number == last).fit(model, data, agent.generator, progress):
                 shown.set_postfix({key.split("/")[-1]: f"{value:.3g}" for key, value in metrics.items()}, refresh=False)
@@ -132,21 +137,20 @@ def search_policy(
     settings = simulation.policy or PolicySearch()
     reported, (data, weights) = 0, folder.search()
     if data is not None and weights is not None and weights.exists():
-        actor_critic = builder.actor_critic(len(envs.situations), settings.hidden)
+        with GlobalChance(0)():  # initial weights, which are replaced
+            actor_critic = builder.actor_critic(len(envs.situations), settings.hidden)
         actor_critic.load_state_dict(load_file(weights))
         return Transitions.load(data), actor_critic.requires_grad_(False)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        search = Search(settings, envs.sources, envs.situations, seed, simulation.episode_length)
-        try:
-            for metrics in search.run():
-                callback(search.done - reported)
-                reported = search.done
-                agent.num_iterations += 1
-                yield metrics
-            transitions, actor_critic = search.transitions(), search.actor_critic()
-        finally:
-            search.close()
+    search = Search(settings, envs.sources, envs.situations, seed, simulation.episode_length)
+    try:
+        for metrics in search.run():
+            callback(search.done - reported)
+            reported = search.done
+            agent.num_iterations += 1
+            yield metrics
+        transitions, actor_critic = search.transitions(), search.actor_critic()
+    finally:
+        search.close()
     if data is not None and weights is not None:
         transitions.save(data)
         with whole_file(weights) as partial_file:
@@ -229,6 +233,23 @@ def begin_model(
         model = policy.model
     policy.world = WorldModel(model, transitions.situations, reward, termination, actor_critic)
     return model, model.encode(obs, action, next_obs)
+
+
+def _warn_of_resolution(transitions: Transitions) -> None:
+    """Warns where robots move by less than a model can see of where they are."""
+    obs, next_obs = (torch.from_numpy(values).flatten(0, 1) for values in (transitions.obs, transitions.next_obs))
+    if torch.equal(obs, next_obs):
+        what = "No dimension of the observations ever changes"
+    elif lost := unresolved(obs, next_obs):
+        what = f"Dimensions {', '.join(map(str, lost))} of the observations change"
+    else:
+        return
+    warnings.warn(
+        f"{what} by no more than single precision (float32, 7 digits) shows of numbers of this size, so that no model "
+        "can learn how. Give the environment in coordinates that begin near the robot: subtract a constant in float64, "
+        "as gymnasium.wrappers.TransformObservation can.",
+        stacklevel=4,
+    )
 
 
 def _bar(name: str, number: int, total: int, unit: str, rounds: int, disable: bool) -> tqdm[Any]:

@@ -89,6 +89,7 @@ class AdaptivePolicy:
         return self.world.dynamics
 
     @property
+    @torch.inference_mode(mode=False)
     def adapter(self) -> Adapter:
         """What adapts the model.
 

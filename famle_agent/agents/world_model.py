@@ -17,6 +17,7 @@ from famle_agent.models.actor_critic import ActorCritic
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.observation import ObservationLayout
 from famle_agent.models.reward import LearnedReward, LearnedTermination
+from famle_agent.utils.chance import GlobalChance
 
 __all__ = ["Interface", "ModelBuilder", "ModelConfig", "WorldModel"]
 
@@ -164,6 +165,17 @@ class ModelBuilder:
             RuntimeError: The weights are of another architecture.
         """
         robots = max(1, len(weights["dynamics"]["embeddings"]) // self.config.members)
+        with GlobalChance(0)():  # initial weights, which are replaced
+            parts = self._untrained(weights, situations, robots)
+        for name, part in parts.items():
+            part.load_state_dict(weights[name])
+            part.requires_grad_(name == "dynamics")
+        return WorldModel(situations=situations, **parts)
+
+    def _untrained(
+        self, weights: Mapping[str, dict[str, Tensor]], situations: tuple[str, ...], robots: int
+    ) -> dict[str, Any]:
+        """Makes the parts that there are weights of."""
         parts: dict[str, Any] = {"dynamics": self.dynamics(len(situations), robots)}
         if weights.get("reward"):
             parts["reward"] = self.reward()
@@ -174,10 +186,7 @@ class ModelBuilder:
                 int(name.split(".")[1]): len(value) for name, value in policy.items() if name.startswith("actor.")
             }
             parts["actor_critic"] = self.actor_critic(len(situations), [layers[i] for i in sorted(layers)[:-1]])
-        for name, part in parts.items():
-            part.load_state_dict(weights[name])
-            part.requires_grad_(name == "dynamics")
-        return WorldModel(situations=situations, **parts)
+        return parts
 
     @property
     def action_scale(self) -> ActionScale:

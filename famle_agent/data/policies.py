@@ -109,7 +109,7 @@ class PlanningPolicy:
     def __call__(self, obs: Array, episode_start: bool) -> Array:
         """Plans from where the last plan left off."""
         if self._plan is None or episode_start:
-            self._plan = torch.zeros(1, self._planner.horizon, *self._space.shape)
+            self._plan = torch.zeros(1, self._planner.horizon, *self._space.shape, dtype=torch.float32)
         state = torch.as_tensor(obs, dtype=torch.float32)[None]
 
         def judge(tau: Tensor) -> Tensor:

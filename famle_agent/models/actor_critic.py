@@ -44,10 +44,10 @@ class ActorCritic(nn.Module):
         inputs = obs_dim + n_situations
         self.actor = mlp([inputs, *hidden, action_dim])
         self.critics = nn.ModuleList(mlp([inputs + action_dim, *hidden, 1]) for _ in range(critics))
-        self.register_buffer("mean", torch.zeros(inputs))
-        self.register_buffer("std", torch.ones(inputs))
-        self.register_buffer("value_scale", torch.ones(()))
-        self.register_buffer("discount", torch.ones(()))
+        self.register_buffer("mean", torch.zeros(inputs, dtype=torch.float32))
+        self.register_buffer("std", torch.ones(inputs, dtype=torch.float32))
+        self.register_buffer("value_scale", torch.ones((), dtype=torch.float32))
+        self.register_buffer("discount", torch.ones((), dtype=torch.float32))
 
     def act(self, obs: Tensor, situation: Tensor) -> Tensor:
         """Returns the actor's mean action in [-1, 1], (..., action_dim), for (..., obs_dim) in situations (...)."""
@@ -74,5 +74,5 @@ def mlp(sizes: Sequence[int]) -> nn.Sequential:
     """Makes layers with rectifiers between them, as Stable-Baselines3 does."""
     layers: list[nn.Module] = []
     for fan_in, fan_out in pairwise(sizes):
-        layers += [nn.Linear(fan_in, fan_out), nn.ReLU()]
+        layers += [nn.Linear(fan_in, fan_out, dtype=torch.float32), nn.ReLU()]
     return nn.Sequential(*layers[:-1])

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from famle_agent.models.likelihood import fitted_scale, log_density
 from famle_agent.models.network import Network, Theta
 from famle_agent.models.observation import ObservationLayout
+from famle_agent.models.scale import deviations
 
 __all__ = ["Batch", "Dynamics", "Theta"]
 
@@ -121,16 +122,14 @@ class Dynamics(nn.Module):
         )
         networks = robots * members
         self.theta = nn.ParameterDict(self.network.initial(networks, initial_weights))
-        self.embeddings = nn.Parameter(torch.randn(networks, n_situations, embedding_dim))
+        self.embeddings = nn.Parameter(torch.randn(networks, n_situations, embedding_dim, dtype=torch.float32))
 
-        self.register_buffer("input_mean", torch.zeros(self.n_features))
-        self.register_buffer("input_std", torch.ones(self.n_features))
-        # Where actions are not normalised these stay as they are, and files do not have them.
-        self.register_buffer("action_mean", torch.zeros(action_dim), persistent=normalise_actions)
-        self.register_buffer("action_std", torch.ones(action_dim), persistent=normalise_actions)
-        self.register_buffer("target_mean", torch.zeros(obs_dim))
-        self.register_buffer("target_std", torch.ones(obs_dim))
-        self.register_buffer("noise_std", torch.ones(networks, obs_dim))
+        # Where actions are not normalised theirs stay as they are, and files do not have them.
+        for name, size in (("input", self.n_features), ("action", action_dim), ("target", obs_dim)):
+            kept = name != "action" or normalise_actions
+            self.register_buffer(f"{name}_mean", torch.zeros(size, dtype=torch.float32), persistent=kept)
+            self.register_buffer(f"{name}_std", torch.ones(size, dtype=torch.float32), persistent=kept)
+        self.register_buffer("noise_std", torch.ones(networks, obs_dim, dtype=torch.float32))
 
     @property
     def n_situations(self) -> int:
@@ -186,14 +185,16 @@ class Dynamics(nn.Module):
 
     def fit_normalisation(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> None:
         """Takes means and deviations over all leading axes of the data, (..., dim) each."""
-        named = {"input": self.layout.features(obs), "target": self.layout.change(obs, next_obs)}
+        size = torch.maximum(obs.abs(), next_obs.abs()).flatten(0, -2).amax(dim=0)  # (obs_dim,)
+        named = {
+            "input": (self.layout.features(obs), None),
+            "target": (self.layout.change(obs, next_obs), size),
+        }
         if self.normalise_actions:
-            named["action"] = action
-        for name, values in named.items():
+            named["action"] = action, None
+        for name, (values, size_of_terms) in named.items():
             flat = values.flatten(0, -2)
-            std = flat.std(dim=0) if flat.shape[1] else flat.mean(dim=0)  # a model may see no more than the actions
-            # A dimension that never varies carries nothing and must not be blown up.
-            getattr(self, f"{name}_std").copy_(torch.where(std > 1e-6, std, 1.0))
+            getattr(self, f"{name}_std").copy_(deviations(flat, size_of_terms))
             getattr(self, f"{name}_mean").copy_(flat.mean(dim=0))
 
     def inputs(self, obs: Tensor, action: Tensor) -> Tensor:
@@ -206,7 +207,7 @@ class Dynamics(nn.Module):
     def encode(self, obs: Tensor, action: Tensor, next_obs: Tensor, weight: Tensor | None = None) -> Batch:
         """Normalises transitions, (B, n, ...) each, for the losses below. Actions lie in [-1, 1] already."""
         targets = (self.layout.change(obs, next_obs) - self.target_mean) / self.target_std
-        weight = torch.ones(obs.shape[:-1], device=obs.device) if weight is None else weight
+        weight = obs.new_ones(obs.shape[:-1]) if weight is None else weight
         return Batch(self.inputs(obs, action), targets, weight)
 
     # --- predictions ------------------------------------------------------------------------------------

@@ -70,14 +70,14 @@ class Network:
         """
 
         def normal(fan_in: int, fan_out: int, inputs: int) -> Tensor:
-            return torch.randn(networks, fan_in, fan_out) / math.sqrt(inputs)
+            return torch.randn(networks, fan_in, fan_out, dtype=torch.float32) / math.sqrt(inputs)
 
         sizes = [self.n_features + self.action_dim, *self.hidden, self.outputs]
         E, R = self.embedding_dim, self.interaction_rank
         theta = {}
         for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
             theta[f"weight_{layer}"] = normal(fan_in, fan_out, fan_in)
-            theta[f"bias_{layer}"] = torch.zeros(networks, fan_out)
+            theta[f"bias_{layer}"] = torch.zeros(networks, fan_out, dtype=torch.float32)
         theta["embedding"] = normal(E, sizes[1], sizes[0] + E)
         if weights == "uniform":
             for layer, fan_in in enumerate((sizes[0] + E, *self.hidden)):

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from famle_agent.models.observation import ObservationLayout
+from famle_agent.models.scale import deviations
 
 __all__ = ["LearnedReward", "LearnedTermination", "Objective", "RewardFn", "TerminationFn"]
 
@@ -37,13 +38,9 @@ class Objective:
 
 
 def _two_hidden_layers(inputs: int, width: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(inputs, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 1))
-
-
-def _deviations(x: Tensor) -> Tensor:
-    """The deviation of each column; what never changed must not be blown up."""
-    std = x.std(dim=0)
-    return torch.where(std > 1e-6, std, 1.0)
+    sizes = ((inputs, width), (width, width), (width, 1))
+    first, second, last = (nn.Linear(*size, dtype=torch.float32) for size in sizes)
+    return nn.Sequential(first, nn.SiLU(), second, nn.SiLU(), last)
 
 
 class LearnedReward(nn.Module):
@@ -65,10 +62,10 @@ class LearnedReward(nn.Module):
         self._layout = replace(layout, pose_dims=())
         inputs = 2 * self._layout.n_features + action_dim
         self.layers = _two_hidden_layers(inputs, width)
-        self.register_buffer("mean", torch.zeros(inputs))
-        self.register_buffer("std", torch.ones(inputs))
-        self.register_buffer("reward_mean", torch.zeros(()))
-        self.register_buffer("reward_std", torch.ones(()))
+        self.register_buffer("mean", torch.zeros(inputs, dtype=torch.float32))
+        self.register_buffer("std", torch.ones(inputs, dtype=torch.float32))
+        self.register_buffer("reward_mean", torch.zeros((), dtype=torch.float32))
+        self.register_buffer("reward_std", torch.ones((), dtype=torch.float32))
 
     def forward(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
         """The reward (...) of transitions (..., obs_dim), (..., action_dim), (..., obs_dim)."""
@@ -89,9 +86,9 @@ class LearnedReward(nn.Module):
         """Least squares by Adam on transitions with any leading axes."""
         x, y = self._inputs(obs, action, next_obs).flatten(0, -2), reward.flatten()
         self.mean.copy_(x.mean(dim=0))
-        self.std.copy_(_deviations(x))
+        self.std.copy_(deviations(x))
         self.reward_mean.copy_(y.mean())
-        self.reward_std.copy_(y.std().clamp(min=1e-6))
+        self.reward_std.copy_(deviations(y[:, None])[0])
         x, y = (x - self.mean) / self.std, (y - self.reward_mean) / self.reward_std
         optimizer = torch.optim.Adam(self.parameters(), lr=1e-3)
         with torch.enable_grad():
@@ -123,8 +120,8 @@ class LearnedTermination(nn.Module):
         self._layout = replace(layout, pose_dims=())
         inputs = self._layout.n_features
         self.layers = _two_hidden_layers(inputs, width)
-        self.register_buffer("mean", torch.zeros(inputs))
-        self.register_buffer("std", torch.ones(inputs))
+        self.register_buffer("mean", torch.zeros(inputs, dtype=torch.float32))
+        self.register_buffer("std", torch.ones(inputs, dtype=torch.float32))
 
     def forward(self, next_obs: Tensor) -> Tensor:
         """Returns whether an episode ends, (...), in observations (..., obs_dim)."""
@@ -138,7 +135,7 @@ class LearnedTermination(nn.Module):
         """Learns from observations with any leading axes; a quarter of each batch are ends, of which there are few."""
         x, y = self._layout.features(next_obs).flatten(0, -2), ended.flatten().float()
         self.mean.copy_(x.mean(dim=0))
-        self.std.copy_(_deviations(x))
+        self.std.copy_(deviations(x))
         x, ends = (x - self.mean) / self.std, torch.where(y > 0.0)[0]
         optimizer = torch.optim.Adam(self.parameters(), lr=1e-3)
         for _ in range(steps):

@@ -120,11 +120,12 @@ def imagine(model: Callable[[Tensor, Tensor], Tensor], objective: Objective, obs
 
 def _imagine(model: Callable[[Tensor, Tensor], Tensor], objective: Objective, obs: Tensor, actions: Tensor) -> Tensor:
     state = obs[:, None].expand(-1, actions.shape[1], -1)  # (K, N, obs_dim)
-    total = torch.zeros(actions.shape[:2], device=obs.device)
+    total = obs.new_zeros(actions.shape[:2])
     weight: Tensor | float = 1.0  # gamma^t, and 0 once the episode has ended
     for action in actions.unbind(dim=2):
         next_state = model(state, action)
-        total = total + weight * objective.reward_fn(state, action, next_state)
+        reward = torch.as_tensor(objective.reward_fn(state, action, next_state), dtype=total.dtype, device=total.device)
+        total = total + weight * reward
         if objective.termination_fn is not None:
             weight = weight * (1.0 - objective.termination_fn(next_state).to(total.dtype))
         weight = weight * objective.discount

@@ -129,7 +129,11 @@ class MAML:
     def sample(self, data: Batch, c: Tensor, members: int, generator: torch.Generator) -> tuple[Batch, Batch]:
         """Draws for each situation in ``c`` and each member transitions for the inner steps, and others to judge by."""
         shape = (len(c), members, data.x.shape[1])
-        order = torch.rand(shape, generator=generator, device=generator.device).argsort(dim=-1).to(data.x.device)
+        order = (
+            torch.rand(shape, generator=generator, device=generator.device, dtype=torch.float32)
+            .argsort(dim=-1)
+            .to(data.x.device)
+        )
         support, query = order[..., : self.batch_size], order[..., self.batch_size :][..., : self.query_size]
         c = c[:, None, None]
         return data[c, support], data[c, query]

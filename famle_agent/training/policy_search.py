@@ -27,10 +27,12 @@ from famle_agent.data import gate
 from famle_agent.data.transitions import EnvSource, Transitions
 from famle_agent.data.watch import Watch
 from famle_agent.models.actor_critic import ActorCritic
+from famle_agent.utils.chance import GlobalChance
 
 __all__ = ["PolicySearch", "Search"]
 
 _CHUNK = 200  # steps of each situation between two reports
+_EPSILON = 1e-20  # added to variances: the square of a unit so small that rounding alone is as large
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ class Search:
     Attributes:
         sac: Stable-Baselines3's soft actor-critic.
         action_space: Of the robot.
-        chance: The state of NumPy's global generator, from which Stable-Baselines3 draws.
+        chance: What Stable-Baselines3 draws, which draws from the global generators.
     """
 
     def __init__(
@@ -110,10 +112,13 @@ class Search:
         self._obs_dim = made[0].observation_space.shape[0]  # type: ignore[index]
         envs = DummyVecEnv([lambda i=i: told(i) for i in range(n)])  # type: ignore[misc]
         envs.seed(seed)
-        self._envs = VecNormalize(envs, gamma=settings.discount)
-        self.chance: Any = np.random.RandomState(seed % 2**32).get_state()
+        self._envs = VecNormalize(envs, gamma=settings.discount, epsilon=_EPSILON)
+        running: Any
+        for running in (self._envs.obs_rms, self._envs.ret_rms):
+            running.count = 0.0  # without a first guess of mean and variance, which would be one of units
+        self.chance = GlobalChance(seed)
         train_every = max(1, 50 // n)
-        with _numpy_chance(self):
+        with self.chance(), _float32():
             self.sac = SAC(
                 "MlpPolicy",
                 self._envs,
@@ -140,7 +145,7 @@ class Search:
         n = self._envs.num_envs
         while self.sac.num_timesteps < self._steps * n:
             left = self._steps - self.sac.num_timesteps // n
-            with _numpy_chance(self):
+            with self.chance(), _float32():
                 self.sac.learn(min(_CHUNK, left) * n, log_interval=None, reset_num_timesteps=False)  # type: ignore[arg-type]
             returns = [info["r"] for info in self.sac.ep_info_buffer or ()]
             yield {"policy/return": float(np.mean(returns))} if returns else {}
@@ -167,14 +172,17 @@ class Search:
     def actor_critic(self) -> ActorCritic:
         """Returns what was learnt."""
         sac, scale, n = self.sac, self._envs, len(self._situations)
-        made = ActorCritic(self._obs_dim, self.action_space.shape[0], n, self._settings.hidden)
+        with self.chance():
+            made = ActorCritic(self._obs_dim, self.action_space.shape[0], n, self._settings.hidden)
         learnt = [*sac.actor.latent_pi.parameters(), *sac.actor.mu.parameters(), *sac.critic.parameters()]
         obs_rms: Any = scale.obs_rms
         with torch.no_grad():
             for mine, theirs in zip([*made.actor.parameters(), *made.critics.parameters()], learnt, strict=True):
                 mine.copy_(theirs)
             made.mean.copy_(torch.as_tensor(obs_rms.mean))
-            made.std.copy_(torch.as_tensor(np.sqrt(obs_rms.var + scale.epsilon)))
+            # What never varied was 0 for the networks, and must not be blown up where it does.
+            varies = obs_rms.var > (1e-6 * obs_rms.mean) ** 2
+            made.std.copy_(torch.as_tensor(np.where(varies, np.sqrt(obs_rms.var + scale.epsilon), 1.0)))
             made.value_scale.fill_(float(np.sqrt(scale.ret_rms.var + scale.epsilon)))
             made.discount.fill_(self._settings.discount)
         return made.requires_grad_(False)
@@ -227,12 +235,11 @@ class _PartlyUntold(ReplayBuffer):
 
 
 @contextmanager
-def _numpy_chance(search: Search) -> Iterator[None]:
-    """Lets Stable-Baselines3 draw from a search's own random numbers, and leaves NumPy's as they were."""
-    outside = np.random.get_state()
-    np.random.set_state(search.chance)
+def _float32() -> Iterator[None]:
+    """Lets Stable-Baselines3 make its networks of the numbers that its buffers hold, whatever else is the default."""
+    outside = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
     try:
         yield
     finally:
-        search.chance = np.random.get_state()
-        np.random.set_state(outside)
+        torch.set_default_dtype(outside)
