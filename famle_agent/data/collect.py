@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,7 +61,7 @@ def collect(
     parts: dict[int, Transitions] = {}
     for here in (True, False):
         some = [task for task in tasks if isinstance(task.env, gym.Env) == here]
-        calls = (delayed(_in_process if n_jobs != 1 and not here else _Task.run)(task) for task in some)
+        calls = (delayed(_in_process)(task, os.getpid()) for task in some)
         for i, part in as_completed(calls, n_jobs=1 if here else n_jobs):
             parts[i] = part
             callback(n)
@@ -107,8 +108,9 @@ class _Task:
         return self.index, part
 
 
-def _in_process(task: _Task) -> tuple[int, Transitions]:
-    torch.set_num_threads(1)  # the parallel processes share the cores
+def _in_process(task: _Task, parent: int) -> tuple[int, Transitions]:
+    if os.getpid() != parent:  # joblib may run it in a thread, or right here
+        torch.set_num_threads(1)  # the parallel processes share the cores
     return task.run()
 
 

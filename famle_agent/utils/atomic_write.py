@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from uuid import uuid4
 
 __all__ = ["whole_file"]
 
@@ -16,7 +16,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
     An older file stays until then; where writing fails, it stays for good.
     """
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    partial = path.with_name(f"{path.name}.{uuid4().hex}.partial")  # threads and machines may write at once
     try:
         yield partial
         partial.replace(path)
