@@ -9,6 +9,7 @@ import zipfile
 import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any, BinaryIO
 
 import gymnasium as gym
@@ -24,7 +25,7 @@ from famle_agent.agents.presets import known_robots
 from famle_agent.models.observation import DIMS
 from famle_agent.utils.atomic_write import whole_file
 
-__all__ = ["Checkpoint", "File", "joined", "read_checkpoint", "write_checkpoint"]
+__all__ = ["Checkpoint", "File", "check_writable", "joined", "read_checkpoint", "write_checkpoint"]
 
 _FORMAT = "famle-agent"
 _VERSION = 2
@@ -52,6 +53,20 @@ def write_checkpoint(file: File, meta: dict[str, Any], tensors: dict[str, Tensor
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as partial:
         partial.write_bytes(_pack(meta, tensors))
+
+
+def check_writable(file: str | os.PathLike[str]) -> None:
+    """Refuses a path at which :func:`write_checkpoint` could not write; makes its folder.
+
+    Raises:
+        OSError: It is a folder, or nothing can be written beside it.
+    """
+    path = _with_suffix(file)
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder; give the path of a file in it.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with NamedTemporaryFile(dir=path.parent, prefix=f"{path.name}.", suffix=".partial"):
+        pass
 
 
 def read_checkpoint(file: File) -> tuple[dict[str, Any], dict[str, Tensor]]:

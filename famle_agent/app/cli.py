@@ -75,15 +75,17 @@ class MetaLearn:
 
     def __call__(self) -> None:
         """Meta-learns and saves."""
+        from famle_agent.agents.checkpoint import check_writable
         from famle_agent.agents.famle import FAMLE
         from famle_agent.utils.parallel import parallel
 
+        check_writable(self.out)  # before all the learning
         log = None if self.tensorboard is None else str(self.tensorboard)
         agent = FAMLE(self.robot, self.mode, seed=self.seed, tensorboard_log=log)
         with parallel(self.backend):
             agent.meta_learn(progress_bar=True, n_jobs=self.jobs, folder=self.folder)
         agent.save(self.out)
-        Console().print(f"Saved {self.out}.")
+        _say(f"Saved {self.out}.")
 
 
 @dataclass(frozen=True)
@@ -113,13 +115,11 @@ class Run:
         if robot is None:
             raise ValueError(f"{self.agent} names no environment that can be made here; use FAMLE.load(path, env).")
         spec = robot.get_attr("spec")[0]
-        env = FAMLEWrapper(gym.make(spec.id, **{**spec.kwargs, "situation": self.situation}), agent)
+        arguments = {**spec.kwargs, "situation": self.situation}
+        env = FAMLEWrapper(gym.make(spec.id, max_episode_steps=spec.max_episode_steps, **arguments), agent)
         for i in range(self.episodes):
             run = rollout(env, self.seed if i == 0 else None)
-            Console().print(
-                f"episode {i}: return {run.total:.1f}, believes {run.situations[-1]} ({run.probability:.0%})",
-                markup=False,
-            )
+            _say(f"episode {i}: return {run.total:.1f}, believes {run.situations[-1]} ({run.probability:.0%})")
         env.close()
 
 
@@ -130,8 +130,19 @@ def main(args: list[str] | None = None) -> None:
         args: The command line without the program's name; None takes the process's own. ``--version`` prints the
             version.
     """
-    if (sys.argv[1:] if args is None else args) == ["--version"]:
-        Console().print(f"famle {__version__}", highlight=False)
+    try:
+        _run(sys.argv[1:] if args is None else args)
+    except KeyboardInterrupt:
+        _say("famle: stopped.", stderr=True)
+        sys.exit(130)  # 128 and the number of the signal, as shells have it
+    except (ImportError, OSError, NotLearnedError, TypeError, ValueError) as error:
+        _say(f"famle: {error}", stderr=True)
+        sys.exit(2)
+
+
+def _run(args: list[str]) -> None:
+    if args == ["--version"]:
+        _say(f"famle {__version__}")
         return
     command = tyro.extras.subcommand_cli_from_dict(
         {"demo": Demo, "meta-learn": MetaLearn, "run": Run}, args=args, prog="famle"
@@ -141,8 +152,9 @@ def main(args: list[str] | None = None) -> None:
     if not isinstance(command, MetaLearn):
         # A plan's matrices are small: a second thread gains little, and waits long where the machine is busy.
         torch.set_num_threads(1)
-    try:
-        command()
-    except (ImportError, OSError, NotLearnedError, TypeError, ValueError) as error:
-        Console(stderr=True).print(f"famle: {error}", markup=False, highlight=False)
-        sys.exit(2)
+    command()
+
+
+def _say(text: str, stderr: bool = False) -> None:
+    """Prints a text as it is: no markup, no emoji, and no line broken where the screen ends."""
+    Console(stderr=stderr).print(text, markup=False, emoji=False, highlight=False, soft_wrap=True)

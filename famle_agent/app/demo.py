@@ -12,8 +12,10 @@ import gymnasium as gym
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 from stable_baselines3.common.logger import Logger, configure
 
+from famle_agent.agents.checkpoint import check_writable
 from famle_agent.agents.famle import FAMLE
 from famle_agent.agents.presets import known_robots
 from famle_agent.agents.tensorboard import encode_gif, log_adaptations, log_gif, log_posterior
@@ -67,6 +69,7 @@ def run_demo(
         ValueError: The robot, the situation or the break is unknown.
     """
     shown, settings = _demo_of(robot, overrides)
+    check_writable(out / "agent.zip")  # before minutes of learning
     situation, console = situation or shown.situation, Console()
     env = gym.make(known_robots()[robot].env_id, render_mode="rgb_array", **shown.env)
     try:
@@ -87,7 +90,13 @@ def run_demo(
     finally:
         env.close()
     written = ", ".join(sorted(path.name for path in out.iterdir() if path.is_file()))
-    console.print(f"Written to {out}/: {written}; see also tensorboard --logdir {out}/tensorboard")
+    console.print(
+        f"Written to {out}/: {written}; see also tensorboard --logdir {out}/tensorboard",
+        markup=False,
+        emoji=False,
+        highlight=False,
+        soft_wrap=True,
+    )
     return runs
 
 
@@ -155,12 +164,12 @@ def _film_rate(env: gym.Env[Any, Any]) -> float:
 
 def _table(runs: Runs, title: str) -> Table:
     """One row an episode; one that the robot breaks in has two, with the return of 1,000 steps at that rate."""
-    table = Table("episode", *(f"return {name}" for name in runs), "believes at the end", "per step", title=title)
+    table = Table("episode", *(f"return {name}" for name in runs), "believes at the end", "per step", title=Text(title))
     adapting = next(iter(runs.values()))
     for i, run in enumerate(adapting):
         cells = [_outcome(episodes[i]) for episodes in runs.values()]
         milliseconds = f"{1e3 * np.median(run.step_seconds):.0f} ms"
-        table.add_row(str(i), *cells, f"{run.situations[-1]} ({run.probability:.0%})", milliseconds)
+        table.add_row(str(i), *cells, Text(f"{run.situations[-1]} ({run.probability:.0%})"), milliseconds)
     return table
 
 

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from famle_agent.data.policies import reward_names
 from famle_agent.data.probe import same_reward
-from famle_agent.data.transitions import EnvSource
+from famle_agent.data.transitions import EnvSource, check_names
 from famle_agent.data.wrappers import Change, layers, robot_layers, vector_layers
 from famle_agent.models.reward import RewardFn, TerminationFn
 from famle_envs.faults import FaultWrapper, make_faulty
@@ -192,7 +192,7 @@ def situation_envs(env: VecEnv, envs: SituationsLike | None, episode_length: int
         label = situation.label if isinstance(situation, Situation) else f"situation {i}"
         own_names = chain([label], (f"{label} ({j})" for j in count(i)))
         labels.append(names[i] if names else next(name for name in own_names if name not in labels))
-        _check_name(labels[-1])
+        check_names(labels)
     return SituationEnvs(sources, labels)
 
 
@@ -237,17 +237,11 @@ def _listed(envs: SituationsLike) -> tuple[list[str], list[EnvLike]]:
         raise ValueError("meta_learn(envs) needs at least one environment, factory or Situation.")
     if not isinstance(envs, Mapping):
         return [], list(envs)
-    for name in envs:
-        _check_name(name)
+    check_names(list(envs))
     return list(envs), list(envs.values())
 
 
 _ENV_LIKE = (gym.Env, Situation, Mapping, str)
-
-
-def _check_name(name: Any) -> None:
-    if not isinstance(name, str) or not name.strip() or not name.isprintable():
-        raise ValueError(f"The name of a situation must be a line of text, got {name!r}.")
 
 
 def _source(env: VecEnv, item: EnvLike, episode_length: int) -> EnvSource:

@@ -6,7 +6,7 @@ import hashlib
 import os
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,30 @@ import numpy.typing as npt
 from famle_agent.data.gate import floats
 from famle_agent.utils.atomic_write import whole_file
 
-__all__ = ["EnvSource", "Transitions"]
+__all__ = ["EnvSource", "Transitions", "check_names"]
 
 Array = npt.NDArray[np.float32]
 EnvSource = gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]]
 """An environment, used where it is and left open; or what makes one, in whatever process, to be closed after use."""
+
+
+def check_names(names: Sequence[Any]) -> None:
+    """Refuses names of situations that could not be told apart where they are written.
+
+    Raises:
+        ValueError: A name is no line of text, or two situations have it, be it because it is composed of others' names.
+    """
+    for name in names:
+        if not isinstance(name, str) or not name.strip() or not name.isprintable():
+            raise ValueError(f"The name of a situation must be a line of text, got {name!r}.")
+        if list(names).count(name) > 1:
+            raise ValueError(f"Two situations are called {name!r}; give each a name of its own.")
+        parts = name.split(" + ")
+        if len(parts) == 2 and all(part in names for part in parts):
+            raise ValueError(
+                f"A situation is called {name!r}, as an agent calls the two together that are named so; give it "
+                "another name."
+            )
 
 
 @dataclass(frozen=True)
@@ -38,7 +57,7 @@ class Transitions:
         terminated: Whether an episode ended by itself, (N, n); None where nobody knows, or none did.
 
     Raises:
-        ValueError: Shapes do not fit, or a value is not finite.
+        ValueError: Shapes do not fit, a value is not finite, or a name is no line of text or is there twice.
     """
 
     obs: Array
@@ -51,6 +70,7 @@ class Transitions:
     def __post_init__(self) -> None:
         for name in ("obs", "action", "reward", "next_obs"):
             object.__setattr__(self, name, floats(name, getattr(self, name)))  # which nobody else can change
+        check_names(self.situations)
         shape = (len(self.situations), self.obs.shape[1] if self.obs.ndim == 3 else -1)
         if 0 in shape:
             raise ValueError("There are no transitions; collect at least one in at least one situation.")
