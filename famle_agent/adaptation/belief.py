@@ -66,8 +66,8 @@ class Candidates:
         """
         faults = (self.pairs > 0).sum(dim=1)  # of each candidate
         if int(faults.max()) < 2:
-            return torch.zeros_like(faults, dtype=torch.float32).log_softmax(dim=0)
-        kind = torch.tensor(_KINDS, device=faults.device) / faults.bincount()
+            return self.h.new_zeros(len(faults)).log_softmax(dim=0)
+        kind = self.h.new_tensor(_KINDS) / faults.bincount()
         return kind[faults].log().log_softmax(dim=0)
 
     def marginal(self, posterior: Tensor) -> Tensor:

@@ -54,7 +54,7 @@ from famle_agent.data.envs import (
 from famle_agent.data.gate import check_action, check_observation, vec_observations, vec_step
 from famle_agent.data.policies import MakePolicy, reward_names
 from famle_agent.data.probe import check_reward_fn, check_termination_fn
-from famle_agent.data.transitions import Transitions
+from famle_agent.data.transitions import Transitions, check_names
 from famle_agent.data.watch import VecWatch
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import prepare_torch
@@ -175,7 +175,7 @@ class ModelBasedAgent(BaseAlgorithm):
                 warnings.warn(
                     f"The model that is shipped for this robot is not taken: it has another "
                     f"{', '.join(self.policy.not_taken)}. meta_learn() learns one; pretrained=False asks for none.",
-                    stacklevel=2,
+                    stacklevel=3,
                 )
 
     def _preset(self, overrides: Mapping[str, Any]) -> str:
@@ -342,10 +342,11 @@ class ModelBasedAgent(BaseAlgorithm):
             The agent.
 
         Raises:
-            ValueError: There are no situations, an environment's spaces differ from the agent's, or the folder is of a
-                run with other settings.
+            ValueError: There are no situations, or their names cannot be told apart; an environment's spaces differ
+                from the agent's; or the folder is of a run with other settings.
         """
         source = envs if isinstance(envs, Transitions) else self.situation_envs(envs)
+        check_names(source.situations)
         run = RunFolder(folder, {} if folder is None else self._fingerprint(source))  # which reads all transitions
         if not self._custom_logger:
             name = tb_log_name or f"{type(self).__name__}_meta"
@@ -392,7 +393,7 @@ class ModelBasedAgent(BaseAlgorithm):
                 "In simulation, planning with what was learnt is no better than doing nothing or acting at random, so "
                 "that it will not be on the robot either. Try more simulated steps (policy_steps), a reward_fn, fewer "
                 f"or milder situations, or whether Stable-Baselines3's SAC learns the intact robot at all.\n{found}",
-                stacklevel=3,
+                stacklevel=4,
             )
 
     @torch.inference_mode(mode=False)
@@ -678,7 +679,7 @@ class ModelBasedAgent(BaseAlgorithm):
                 "taken back. Take smaller rates (adapt_lr, adapt_embedding_lr), or meta-learn on data that reach where "
                 'the robot is (action_hold, episode_length, rounds). info["famle"]["diverged"] and adapt/diverged '
                 "count them from here on.",
-                stacklevel=3,
+                stacklevel=4,
             )
         return state
 

@@ -248,7 +248,7 @@ def _warn_of_resolution(transitions: Transitions) -> None:
         f"{what} by no more than single precision (float32, 7 digits) shows of numbers of this size, so that no model "
         "can learn how. Give the environment in coordinates that begin near the robot: subtract a constant in float64, "
         "as gymnasium.wrappers.TransformObservation can.",
-        stacklevel=4,
+        stacklevel=5,
     )
 
 

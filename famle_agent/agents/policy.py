@@ -142,7 +142,7 @@ class AdaptivePolicy:
         warnings.warn(
             "What the stored agent believed of its robot is left behind: it told other situations apart than these "
             "settings do (compose). The agent begins with what it meta-learned.",
-            stacklevel=4,
+            stacklevel=5,
         )
         return None
 

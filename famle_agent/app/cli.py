@@ -79,9 +79,9 @@ class MetaLearn:
         from famle_agent.agents.famle import FAMLE
         from famle_agent.utils.parallel import parallel
 
-        check_writable(self.out)  # before all the learning
         log = None if self.tensorboard is None else str(self.tensorboard)
         agent = FAMLE(self.robot, self.mode, seed=self.seed, tensorboard_log=log)
+        check_writable(self.out)  # before all the learning
         with parallel(self.backend):
             agent.meta_learn(progress_bar=True, n_jobs=self.jobs, folder=self.folder)
         agent.save(self.out)

@@ -69,12 +69,12 @@ def run_demo(
         ValueError: The robot, the situation or the break is unknown.
     """
     shown, settings = _demo_of(robot, overrides)
-    check_writable(out / "agent.zip")  # before minutes of learning
     situation, console = situation or shown.situation, Console()
     env = gym.make(known_robots()[robot].env_id, render_mode="rgb_array", **shown.env)
     try:
-        # A wrong name, or a machine that cannot render, should fail before minutes of learning.
+        # A wrong name or path, or a machine that cannot render, should fail before minutes of learning.
         env.unwrapped.set_situation(situation)  # type: ignore[attr-defined]
+        check_writable(out / "agent.zip")
         env.reset(seed=seed)
         env.render()
         label = env.get_wrapper_attr("situation").label

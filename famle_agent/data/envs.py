@@ -390,7 +390,7 @@ def _changed(env: VecEnv, name: str, argument: str, matters: Change) -> tuple[bo
         warnings.warn(
             f"{', '.join(doubtful)} may change what the environment's {name} is of: who meta-learns takes what happens "
             f"in simulation instead. Where it changes nothing, say {argument}=env.get_wrapper_attr({name!r}).",
-            stacklevel=5,
+            stacklevel=6,
         )
     return any(layer.is_known for layer in between), bool(doubtful)
 

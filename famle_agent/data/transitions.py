@@ -57,7 +57,7 @@ class Transitions:
         terminated: Whether an episode ended by itself, (N, n); None where nobody knows, or none did.
 
     Raises:
-        ValueError: Shapes do not fit, a value is not finite, or a name is no line of text or is there twice.
+        ValueError: Shapes do not fit, or a value is not finite.
     """
 
     obs: Array
@@ -70,7 +70,6 @@ class Transitions:
     def __post_init__(self) -> None:
         for name in ("obs", "action", "reward", "next_obs"):
             object.__setattr__(self, name, floats(name, getattr(self, name)))  # which nobody else can change
-        check_names(self.situations)
         shape = (len(self.situations), self.obs.shape[1] if self.obs.ndim == 3 else -1)
         if 0 in shape:
             raise ValueError("There are no transitions; collect at least one in at least one situation.")

@@ -197,3 +197,11 @@ def test_one_member_that_diverges_leaves_the_whole_robot_where_it_started(two_mo
     assert torch.equal(belief.h[1], selected[:, 1])
     assert not torch.equal(belief.h[0], selected[:, 0])
     assert belief.is_finite().all()
+
+
+@given(st.integers(1, 12))
+def test_nothing_is_likelier_than_the_intact_robot_before_anything_is_seen(n_situations: int) -> None:
+    prior = Candidates.of(simple_model(n_situations=n_situations), compose=True).log_prior.exp()
+    assert prior.sum() == pytest.approx(1.0)
+    assert prior.argmax() == 0
+    assert (prior <= prior[0]).all()

@@ -190,3 +190,17 @@ def test_rival_without_embeddings_across_modes() -> None:
     with torch.inference_mode(), default_dtype(torch.float64):
         agent = AMPC("reacher", seed=0, device="cpu", transitions_per_situation=20).meta_learn()
     agent.learn(6)
+
+
+def test_warnings_point_at_who_called(make_env: MakeEnv) -> None:
+    class Passing(gym.Wrapper[Any, Any, Any, Any]):
+        def step(self, action: Any) -> Any:
+            return self.env.step(action)
+
+    settings = {**SETTINGS, "joint_iterations": 1}
+    with pytest.warns(UserWarning) as said:
+        FAMLE("ant", device="cpu", hidden=(8,))
+        FAMLE(Passing(make_env()), device="cpu", angle_dims=())
+        far = Point(1.0, (388096.0, 3948996.0))
+        FAMLE(far, reward_fn=lambda o, a, n: n[..., 0], **settings).meta_learn([far], check=False)
+    assert [warning.filename for warning in said] == [__file__] * 3

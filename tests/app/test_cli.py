@@ -3,12 +3,15 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import pytest
 import torch
 
 import famle_agent
 from famle_agent import FAMLE
+from famle_agent.app import demo
 from famle_agent.app.cli import main
 from famle_envs.reacher import ReacherEnv
 
@@ -149,3 +152,90 @@ def test_command_line_knows_which_robots_it_can_show(capsys: pytest.CaptureFixtu
     with pytest.raises(SystemExit):
         main(["demo", "--robot", "octopus"])
     assert "ant" in capsys.readouterr().err
+
+
+# --- text that goes elsewhere ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def learns_nothing(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Notes that an agent should have learnt, which has a model already."""
+    asked: list[str] = []
+
+    def meta_learn(agent: FAMLE, *_: Any, **__: Any) -> FAMLE:
+        asked.append("meta-learn")
+        return agent
+
+    monkeypatch.setattr(FAMLE, "meta_learn", meta_learn)
+    return asked
+
+
+@pytest.mark.parametrize(
+    "name", ["[v1]/a.zip", "x[/b]/a.zip", "[red]a.zip", ":dog:.zip", "a b.zip", f"{'long/' * 30}a.zip"]
+)
+def test_path_is_printed_as_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], learns_nothing: list[str], name: str
+) -> None:
+    main(["meta-learn", "--robot", "ant", "--out", str(tmp_path / name)])
+    assert capsys.readouterr().out == f"Saved {tmp_path / name}.\n"
+    assert (tmp_path / name).is_file()
+
+
+@pytest.mark.parametrize(
+    ("command", "out"),
+    [("meta-learn", "file/a.zip"), ("meta-learn", "folder/agent.zip"), ("demo", "file"), ("demo", "folder")],
+)
+def test_path_that_cannot_be_written_is_refused_before_learning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], learns_nothing: list[str], command: str, out: str
+) -> None:
+    (tmp_path / "file").write_text("something else")
+    (tmp_path / "folder" / "agent.zip").mkdir(parents=True)
+    with pytest.raises(SystemExit) as caught:
+        main([command, "--robot", "reacher", "--out", str(tmp_path / out)])
+    assert caught.value.code == 2
+    assert str(tmp_path) in capsys.readouterr().err.replace("\n", "")
+    assert learns_nothing == []
+    assert (tmp_path / "file").read_text() == "something else"
+
+
+def test_trying_a_path_leaves_the_older_agent_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "agent.zip"
+    path.write_text("older")
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise ValueError("learning failed")
+
+    monkeypatch.setattr(FAMLE, "meta_learn", fail)
+    with pytest.raises(SystemExit):
+        main(["meta-learn", "--robot", "ant", "--out", str(path)])
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("agent.zip", "older")]
+
+
+def test_episodes_last_as_long_as_those_of_the_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, lengths = tmp_path / "short.zip", []
+    agent = FAMLE(gym.make("FamleReacher-v0", max_episode_steps=4), seed=0, device="cpu").meta_learn()
+    agent.save(path)
+    roll_out = famle_agent.rollout.rollout
+
+    def watched(*args: Any, **kwargs: Any) -> Any:
+        lengths.append((run := roll_out(*args, **kwargs)).steps)
+        return run
+
+    monkeypatch.setattr(famle_agent.rollout, "rollout", watched)
+    main(["run", str(path), "--episodes", "2"])
+    assert lengths == [4, 4]
+
+
+@pytest.mark.parametrize("command", ["meta-learn", "demo"])
+def test_interruption_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    def interrupt(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(FAMLE, "meta_learn", interrupt)
+    monkeypatch.setattr(demo, "_run", interrupt)
+    with pytest.raises(SystemExit) as caught:
+        main([command, "--robot", "reacher", "--out", str(tmp_path / "out")])
+    assert caught.value.code == 130
+    assert capsys.readouterr().err == "famle: stopped.\n"

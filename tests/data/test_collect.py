@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from joblib import parallel_config
 
 from famle_agent.data.collect import collect
 from famle_agent.data.policies import make_held_uniform
@@ -167,6 +169,18 @@ def test_processes_collect_what_one_would() -> None:
     parallel = collected(n=12, envs=envs, n_jobs=2, callback=counts.append)
     assert counts == [12, 12, 12]
     assert_equal(parallel, collected(n=12, envs=[partial(Clock, 3), Clock(5), partial(Clock, 4)]))
+
+
+@pytest.mark.parametrize("backend", ["threading", "sequential"])
+def test_collecting_in_this_process_keeps_the_number_of_threads(backend: str) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with parallel_config(backend):
+            collected(envs=[partial(Clock, 3), partial(Clock, 5)], n_jobs=2)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
 
 
 # --- a folder -----------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -87,3 +88,24 @@ def test_broken_robot_is_trained_on_the_faults_of_its_motors(make_env: MakeEnv) 
 def test_names_and_faults_that_make_no_sense_are_refused(own: str, envs: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         FAMLE(own, device="cpu").meta_learn(envs)
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (("intact", ""), "must be a line of text, got ''"),
+        (("intact", "a\nb"), "must be a line of text"),
+        (("a\tb", "intact"), "must be a line of text"),
+        (("intact", "intact"), "Two situations are called 'intact'"),
+        (("a", "b", "a + b"), r"called 'a \+ b'.*another name"),
+    ],
+)
+def test_names_of_transitions_that_cannot_be_told_apart_are_refused(names: tuple[str, ...], message: str) -> None:
+    n = len(names)
+    agent = pendulum(transitions_per_situation=4)
+    data = agent.collect(["intact"] * n)
+    with pytest.raises(ValueError, match=message):
+        agent.meta_learn(replace(data, situations=names))
+    if len(set(names)) == n:
+        with pytest.raises(ValueError, match=message):
+            agent.collect(dict.fromkeys(names, "intact"))

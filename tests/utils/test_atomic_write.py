@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -31,3 +32,17 @@ def test_failed_write_changes_nothing(older: bool, tmp_path: Path) -> None:
     with pytest.raises(OSError, match="No space left"):
         fail()
     assert {file.name: file.read_text() for file in tmp_path.iterdir()} == ({"file.txt": "older"} if older else {})
+
+
+def test_threads_may_write_the_same_file(tmp_path: Path) -> None:
+    path = tmp_path / "file.txt"
+
+    def write(text: str) -> None:
+        for _ in range(50):
+            with whole_file(path) as partial:
+                partial.write_text(text * 1000)
+
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(write, "abcd"))
+    assert path.read_text() in {text * 1000 for text in "abcd"}
+    assert list(tmp_path.iterdir()) == [path]
