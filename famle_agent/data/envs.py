@@ -159,8 +159,8 @@ def situation_envs(env: VecEnv, envs: SituationsLike | None, episode_length: int
 
     Raises:
         ValueError: No situation is given or known, a robot cannot have one, the name of one is not a line of text, the
-            spaces of one differ from the agent's, one has a profile other than the simulator's, or ends its episodes
-            too early.
+            spaces of one differ from the agent's, one has a profile other than the simulator's, ends its episodes too
+            early, or stands for two situations; or a factory returns an environment that was there before.
     """
     if envs is None:
         envs = list(env_attribute(env, "training_situations", ()))
