@@ -92,6 +92,7 @@ def walker() -> FAMLE:
 
 def walk(agent: FAMLE, steps: int, **kwargs: Any) -> Rollout:
     env = gym.make("FamleQuadruped-v0", max_episode_steps=steps, **kwargs)
+    agent.set_env(env)  # whose goal is the one to plan for
     agent.forget()
     run = rollout(FAMLEWrapper(env, agent), seed=0)
     env.close()

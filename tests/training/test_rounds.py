@@ -29,7 +29,6 @@ TINY: dict[str, Any] = {
     "joint_batch_size": 32,
     "meta_iterations": 3,
     "meta_batch_size": 3,
-    "inner_steps": 2,
     "horizon": 3,
     "candidates": 8,
     "planner_iterations": 2,
