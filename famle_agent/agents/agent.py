@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from importlib.resources import as_file
@@ -19,7 +19,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
-from stable_baselines3.common.utils import check_for_correct_spaces, configure_logger, safe_mean
+from stable_baselines3.common.utils import check_for_correct_spaces, configure_logger, get_system_info
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from tqdm.auto import tqdm
 from typing_extensions import Self
@@ -31,7 +31,9 @@ from famle_agent.adaptation.diagnosis import Diagnosis
 from famle_agent.agents.check import Check, check_plans
 from famle_agent.agents.checkpoint import Checkpoint, File, joined
 from famle_agent.agents.config import Config
+from famle_agent.agents.logs import console_for_bars, log_episodes, log_time
 from famle_agent.agents.meta_training import meta_train, planning_policy, simulate
+from famle_agent.agents.parameters import Parameters, parameters_of, with_parameters
 from famle_agent.agents.policy import AdaptivePolicy
 from famle_agent.agents.presets import make_env, robot_of
 from famle_agent.agents.tensorboard import log_adaptations, log_embeddings, log_posterior
@@ -87,7 +89,11 @@ class ModelBasedAgent(BaseAlgorithm):
         pose_dims: x, y and heading of a robot on a floor, the heading as an angle or as its sine and its cosine: with
             them, the model knows that a robot moves alike wherever it stands and looks. None takes the environment's
             ``pose_dims`` where the settings are ``egocentric``.
+        policy: Accepted by name, as Stable-Baselines3's algorithms have it: None or ``"MlpPolicy"``. The agent plans
+            with what it learns, and has no other.
+        stats_window_size: Episodes over which :meth:`learn` reports mean returns and successes.
         tensorboard_log: Folder for TensorBoard; None logs nothing there.
+        monitor_wrapper: Whether to wrap a single environment in a ``Monitor``, which reports the returns of episodes.
         verbose: 0 for silence, 1 for information, 2 for debugging.
         device: ``"auto"``, ``"cpu"`` or ``"cuda"``.
         seed: Seed of everything; the same seed gives the same agent.
@@ -104,8 +110,8 @@ class ModelBasedAgent(BaseAlgorithm):
 
     Raises:
         TypeError: An override is no setting.
-        ValueError: The environment is unknown or its spaces are not supported; a setting is out of range, or has no
-            effect beside the others.
+        ValueError: The environment is unknown or its spaces are not supported; the policy is another; a setting is out
+            of range, or has no effect beside the others.
     """
 
     implied: ClassVar[Mapping[str, Any]] = {}
@@ -131,7 +137,10 @@ class ModelBasedAgent(BaseAlgorithm):
         angle_dims: Sequence[int] | None = None,
         quaternion_dims: Sequence[int] | None = None,
         pose_dims: Sequence[int] | None = None,
+        policy: str | None = None,
+        stats_window_size: int = 100,
         tensorboard_log: str | None = None,
+        monitor_wrapper: bool = True,
         verbose: int = 0,
         device: torch.device | str = "auto",
         seed: int | None = None,
@@ -139,6 +148,7 @@ class ModelBasedAgent(BaseAlgorithm):
         config: Config | None = None,
         **overrides: Any,
     ) -> None:
+        _check_policy(env, policy)
         if env is not None:
             env = make_env(env)
             check_spaces(env.observation_space, env.action_space)
@@ -146,12 +156,15 @@ class ModelBasedAgent(BaseAlgorithm):
             policy=BasePolicy,
             env=env,
             learning_rate=0.0,  # the settings have rates of their own
+            stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
+            monitor_wrapper=monitor_wrapper,
             verbose=verbose,
             device=device,
             support_multi_env=True,
             seed=seed,
         )
+        self._monitor_wrapper = monitor_wrapper
         self.mode, self._env_spec = mode, None if self.env is None else _description(self.env)
         robot = robot_of(None if self.env is None else env_id(self.env))
         if config is None:
@@ -197,6 +210,7 @@ class ModelBasedAgent(BaseAlgorithm):
         self.policy.world = self._live = None
         self.num_iterations, self.last_check = 0, None
         self._served: object = None
+        self._told: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None  # what observe() was last told
         self._refused: OnlineState | None = None  # the state whose last observation was refused
         self._calls = 0  # of the environment's steps and resets when learn() last ended
         self._warned_of_divergence = False
@@ -221,7 +235,7 @@ class ModelBasedAgent(BaseAlgorithm):
         Raises:
             ValueError: The spaces differ, or the environment normalises observations.
         """
-        wrapped = self._wrap_env(make_env(env), self.verbose)
+        wrapped = self._wrap_env(make_env(env), self.verbose, self._monitor_wrapper)
         check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
         self._env_spec = _description(wrapped)
         self._take_reward(wrapped)
@@ -329,7 +343,7 @@ class ModelBasedAgent(BaseAlgorithm):
                 List the situation first that the robot is in until it shows otherwise.
             callback: Stable-Baselines3 callbacks, or a function.
             tb_log_name: Name of the run in TensorBoard; by default the class and ``_meta``.
-            progress_bar: Whether to show progress bars.
+            progress_bar: Whether to show progress bars; with ``verbose=1``, in the place of the tables of losses.
             n_jobs: Processes that simulate, -1 for one a core. The result does not depend on it. A policy is learnt in
                 this process alone.
             folder: Where transitions are stored as they come, the model after each round, and once a minute how far
@@ -360,10 +374,14 @@ class ModelBasedAgent(BaseAlgorithm):
             self.generator.manual_seed(self.seed)  # the same call draws the same numbers, be it the first or not
         hooks.on_training_start(locals(), globals())
         try:
-            with closing(meta_train(self, source, run, n_jobs, progress_bar)) as training:
+            with (
+                console_for_bars(self.logger, progress_bar),
+                closing(meta_train(self, source, run, n_jobs, progress_bar)) as training,
+            ):
                 for metrics in training:
                     for key, value in metrics.items():
                         self.logger.record(key, value)
+                    self.logger.record("time/iterations", self.num_iterations, exclude="tensorboard")
                     if self.num_iterations % max(1, total_timesteps // 200) == 0:
                         self.logger.dump(self.num_iterations)
                     hooks.update_locals(locals())
@@ -436,7 +454,7 @@ class ModelBasedAgent(BaseAlgorithm):
         self,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        log_interval: int = 1,
+        log_interval: int | None = 1,
         tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
@@ -444,17 +462,23 @@ class ModelBasedAgent(BaseAlgorithm):
         """Lives on the robot (the agent's environment), adapting all the time: Algorithm 2 for some steps.
 
         Meta-learns first where that has not been done. What was learnt stays: :meth:`predict` without a state
-        goes on from there, until :meth:`forget`. To callbacks each step is a rollout, as with an off-policy algorithm
-        that learns at every step.
+        goes on from there, until :meth:`forget`, for as many observations as there are robots. What each of several
+        robots has is its own: a single observation is then of a robot of which nothing is known. To callbacks each step
+        is a rollout, as with an off-policy algorithm that learns at every step.
 
         Args:
             total_timesteps: Steps of the robot, all robots of a ``VecEnv`` counted.
             callback: Stable-Baselines3 callbacks, or a function.
-            log_interval: Episodes between two logs.
+            log_interval: Episodes between two logs; None logs when a callback asks for it (:meth:`dump_logs`).
             tb_log_name: Name of the run in TensorBoard; by default the class.
             reset_num_timesteps: Whether to count from 0 and to reset the environment.
             progress_bar: Whether to show a progress bar.
+
+        Raises:
+            ValueError: The agent has no environment, or ``log_interval`` is not positive.
         """
+        if log_interval is not None and log_interval < 1:
+            raise ValueError(f"log_interval must be a number of episodes, or None for no logs; got {log_interval}.")
         env = self._require_env()
         if self.policy.world is None:
             self.meta_learn(progress_bar=progress_bar)
@@ -465,6 +489,7 @@ class ModelBasedAgent(BaseAlgorithm):
         )
         hooks.on_training_start(locals(), globals())
         controller, state, watch = self.controller, self.state_of(env.num_envs), VecWatch(env)
+        self._told = None
         self._calls = watch.calls
         while self.num_timesteps < total_timesteps:
             hooks.on_rollout_start()
@@ -487,24 +512,32 @@ class ModelBasedAgent(BaseAlgorithm):
             if not hooks.on_step():
                 break
             hooks.on_rollout_end()
-            self._log_episodes(state, int(dones.sum()), log_interval)
+            self._count_episodes(int(dones.sum()), log_interval)
         hooks.on_training_end()
         return self
 
-    def _log_episodes(self, state: OnlineState, ended: int, log_interval: int) -> None:
-        logged = self._episode_num // log_interval
-        self._episode_num += ended
-        if self._episode_num // log_interval == logged:
-            return
-        if self.ep_info_buffer:
-            self.logger.record("rollout/ep_rew_mean", safe_mean([info["r"] for info in self.ep_info_buffer]))
-            self.logger.record("rollout/ep_len_mean", safe_mean([info["l"] for info in self.ep_info_buffer]))
-            self.logger.record("rollout/ep_rew_last", self.ep_info_buffer[-1]["r"])
-        posterior = self.posterior(state)
-        self.logger.record("adapt/situation", max(posterior, key=lambda name: posterior[name]), exclude="tensorboard")
-        log_posterior(self.logger, self.marginals(state))
-        log_adaptations(self.logger, state.belief)
-        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+    def _count_episodes(self, ended: int, log_interval: int | None) -> None:
+        known, self._episode_num = self._episode_num, self._episode_num + ended
+        if log_interval is not None and self._episode_num // log_interval > known // log_interval:
+            self.dump_logs()
+
+    def dump_logs(self) -> None:
+        """Writes to the logger what :meth:`learn` knows now; Stable-Baselines3's ``LogEveryNTimesteps`` calls it.
+
+        Raises:
+            ValueError: Nothing was learnt yet, so that there is no logger.
+        """
+        if not hasattr(self, "_logger"):
+            raise ValueError("The agent has no logger yet; call learn() or set_logger() first.")
+        log_episodes(self.logger, self.ep_info_buffer or (), self.ep_success_buffer or ())
+        if self._live is not None:
+            posterior = self.posterior()
+            most_likely = max(posterior, key=lambda name: posterior[name])
+            self.logger.record("adapt/situation", most_likely, exclude="tensorboard")
+            log_posterior(self.logger, self.marginals())
+            log_adaptations(self.logger, self._live.belief)
+        since_start = self.num_timesteps - self._num_timesteps_at_start
+        log_time(self.logger, self.num_timesteps, since_start, self._episode_num, self.start_time)
         self.logger.dump(self.num_timesteps)
 
     @torch.inference_mode(mode=False)
@@ -520,7 +553,11 @@ class ModelBasedAgent(BaseAlgorithm):
         The state carries the memory and the adapted model, as a recurrent policy's carries its hidden state. Pass
         back what the last call returned, and every K steps the model is adapted to the last M transitions. Without
         a state, the agent acts on what it believes now: what :class:`FAMLEWrapper` or :meth:`learn` have taught it
-        about this robot, or what it meta-learned.
+        about this robot, or what it meta-learned. What it believes of several robots is of each of them: it acts on
+        that where as many observations are given, and on what it meta-learned where there is another number.
+
+        A step that :meth:`observe` was told of is not counted again: the state that is returned then believes what the
+        agent believes. So a ``FAMLEWrapper`` and a loop that passes the state back (``evaluate_policy``) adapt once.
 
         Args:
             observation: (obs_dim,) for one robot or (B, obs_dim) for B.
@@ -564,10 +601,20 @@ class ModelBasedAgent(BaseAlgorithm):
             if self._live is not None and self._live.robots == len(obs):
                 self._live = replace(self._live, plan=state.plan)  # a loop that drops the state keeps its plan
         else:
-            action, state = controller.act(controller.observe(state, obs, starts), obs, starts, generator)
+            action, state = controller.act(self._caught_up(state, obs, starts), obs, starts, generator)
         self._observed(state)
         actions = to_action_space(action, self.action_space)
         return (actions[0] if numbers.ndim == 1 else actions), state
+
+    def _caught_up(self, state: OnlineState, obs: torch.Tensor, starts: torch.Tensor) -> OnlineState:
+        """Adds the step that ends here to a state, unless :meth:`observe` was told of it."""
+        if self._live is None or self._told is None or state.last is None or len(self._told[0]) != len(obs):
+            return self.controller.observe(state, obs, starts)
+        (s, a, s_next), (last_s, last_a) = self._told, state.last
+        same_step = torch.equal(s, last_s) and torch.allclose(a, last_a, atol=1e-5)
+        if not (same_step and torch.equal(s_next[~starts], obs[~starts])):
+            return self.controller.observe(state, obs, starts)
+        return replace(self._live, plan=state.plan, last=None)
 
     @torch.inference_mode(mode=False)
     def observe(self, obs: Array, action: Array, next_obs: Array) -> None:
@@ -587,7 +634,8 @@ class ModelBasedAgent(BaseAlgorithm):
         a = self.policy.builder.tensor(np.atleast_2d(check_action(action, self.action_space)))
         if not len(s) == len(a) == len(s_next):
             raise ValueError(f"Got {len(s)} observations, {len(a)} actions and {len(s_next)} next observations.")
-        state = replace(self.state_of(len(s)), last=(s, self.policy.builder.action_scale.to_unit(a).clamp(-1.0, 1.0)))
+        a = self.policy.builder.action_scale.to_unit(a).clamp(-1.0, 1.0)
+        state, self._told = replace(self.state_of(len(s)), last=(s, a)), (s, a, s_next)
         moved = torch.zeros(len(s), dtype=torch.bool, device=self.device)
         self._live = self._observed(controller.observe(state, s_next, moved))
 
@@ -639,21 +687,11 @@ class ModelBasedAgent(BaseAlgorithm):
         return (self._live or self.state_of(self.model.robots)).belief
 
     @torch.inference_mode(mode=False)
-    def posterior(self, state: OnlineState | None = None) -> dict[str, float]:
-        """P(situation | memory) by name, of the first robot; of what the agent believes now, or of a state.
+    def posterior(self, state: OnlineState | None = None, robot: int = 0) -> dict[str, float]:
+        """Says how likely each situation is by name, P(situation | memory).
 
         Where faults are composed, ``"a + b"`` is the situation with both. An agent without embeddings has one model
         for ``"every situation"``.
-        """
-        return self.adapter.posterior(self.belief if state is None else state.belief, self.situations)
-
-    @torch.inference_mode(mode=False)
-    def marginals(self, state: OnlineState | None = None) -> dict[str, float]:
-        """As :meth:`posterior`, but of each training situation, be it alone or a part of what is wrong."""
-        return self.adapter.marginals(self.belief if state is None else state.belief, self.situations)
-
-    def diagnose(self, state: OnlineState | None = None, robot: int = 0) -> Diagnosis:
-        """Says in words what is most likely wrong with a robot, and how sure that is: ``print(agent.diagnose())``.
 
         Args:
             state: As :meth:`predict` returns it; None asks what the agent believes now.
@@ -663,12 +701,27 @@ class ModelBasedAgent(BaseAlgorithm):
             IndexError: There is no such robot.
             NotLearnedError: The agent has no model yet.
         """
+        return self.adapter.posterior(self._state_for(state, robot).belief.of(robot), self.situations)
+
+    @torch.inference_mode(mode=False)
+    def marginals(self, state: OnlineState | None = None, robot: int = 0) -> dict[str, float]:
+        """As :meth:`posterior`, but of each training situation, be it alone or a part of what is wrong."""
+        return self.adapter.marginals(self._state_for(state, robot).belief.of(robot), self.situations)
+
+    def diagnose(self, state: OnlineState | None = None, robot: int = 0) -> Diagnosis:
+        """Says in words what is most likely wrong with a robot, and how sure that is: ``print(agent.diagnose())``.
+
+        Arguments and errors as of :meth:`posterior`.
+        """
+        state = self._state_for(state, robot)
+        error, steps = state.belief.of(robot).error, int(state.memory.weight[robot].sum())
+        return Diagnosis.of(self.posterior(state, robot), error, steps)
+
+    def _state_for(self, state: OnlineState | None, robot: int) -> OnlineState:
         state = state or self._live or self.state_of(self.model.robots)
         if not 0 <= robot < state.robots:
             raise IndexError(f"There are robots 0 to {state.robots - 1}, not {robot}.")
-        belief = state.belief.of(robot)
-        posterior = self.adapter.posterior(belief, self.situations)
-        return Diagnosis.of(posterior, belief.error, int(state.memory.weight[robot].sum()))
+        return state
 
     def _observed(self, state: OnlineState) -> OnlineState:
         """Passes a state on, and warns of the first adaptation that diverged."""
@@ -699,7 +752,9 @@ class ModelBasedAgent(BaseAlgorithm):
 
     # --- saving and loading -----------------------------------------------------------------------------
 
-    def save(self, path: File) -> None:  # type: ignore[override]
+    def save(  # type: ignore[override]
+        self, path: File, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
+    ) -> None:
         """Writes the agent, what it believes now included, as JSON and safetensors in a zip; no pickle.
 
         The environment is named, not stored. A ``reward_fn`` given to the constructor is not stored either and has
@@ -707,10 +762,17 @@ class ModelBasedAgent(BaseAlgorithm):
 
         Args:
             path: A path, ``.zip`` is appended where it has no suffix; or a binary file.
+            exclude: What to leave out, such as ``"live"``, what the agent believes now, ``"seed"`` or
+                ``"tensorboard_log"``. As in Stable-Baselines3, names that no file holds change nothing.
+            include: What to store although it is in ``exclude``.
+
+        Raises:
+            ValueError: The agent has no environment; no agent can be made without what is excluded; or what is
+                included is nothing that a file can hold.
         """
         if not hasattr(self, "observation_space"):
             raise ValueError("This agent has no environment, so that there is nothing to save; make it with one.")
-        live, world = self._live, self.policy.world
+        live = self._live
         Checkpoint(
             kind=type(self).__name__,
             mode=self.mode,
@@ -725,14 +787,16 @@ class ModelBasedAgent(BaseAlgorithm):
             seed=self.seed,
             num_timesteps=self.num_timesteps,
             episodes=self._episode_num,
+            verbose=self.verbose,
+            tensorboard_log=None if self.tensorboard_log is None else str(self.tensorboard_log),
             live=None if live is None else live.counts,
             tensors=joined(
-                **({} if world is None else {name: part.state_dict() for name, part in world.parts().items()}),
+                **parameters_of(self.policy.world),
                 live={} if live is None else live.to_tensors(),
                 # The state of another device's generator means nothing elsewhere.
                 generator={"state": self.generator.get_state()} if self.device.type == "cpu" else {},
             ),
-        ).write(path)
+        ).without(exclude or (), include or ()).write(path)
 
     @classmethod
     @torch.inference_mode(mode=False)
@@ -743,6 +807,10 @@ class ModelBasedAgent(BaseAlgorithm):
         device: torch.device | str = "auto",
         reward_fn: RewardFn | None = None,
         termination_fn: TerminationFn | None = None,
+        *,
+        custom_objects: Mapping[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
         **overrides: Any,
     ) -> Self:
         """Reads an agent that :meth:`save` wrote; it acts as the saved one would have. Runs no code from the file.
@@ -753,6 +821,11 @@ class ModelBasedAgent(BaseAlgorithm):
             device: As in the constructor.
             reward_fn: As in the constructor; needed where the agent was made with one.
             termination_fn: As in the constructor; needed where the agent was made with one.
+            custom_objects: What to take in the place of what the file holds, by name. As in Stable-Baselines3, names
+                that the file does not hold change nothing; among ``overrides`` they are refused.
+            print_system_info: Whether to print which system and libraries these are; a file names none.
+            force_reset: Accepted as in Stable-Baselines3. No file says where a robot is: the first :meth:`learn` resets
+                it in any case.
             **overrides: Settings to change, and ``verbose`` or ``tensorboard_log``.
 
         Raises:
@@ -764,12 +837,18 @@ class ModelBasedAgent(BaseAlgorithm):
             raise ValueError(
                 "A stored agent has all its settings, and no other mode; give load() the settings to change."
             )
+        if print_system_info:
+            get_system_info()
         stored = Checkpoint.read(path)
+        overrides = stored.replaced_by(custom_objects or {}) | overrides
+        reward_fn = reward_fn or overrides.pop("reward_fn", None)
+        termination_fn = termination_fn or overrides.pop("termination_fn", None)
         stored.check_agent(cls.__name__, reward_fn is not None, termination_fn is not None)
         if (made := stored.make_env() if env is None else make_env(env)) is not None:
             stored.check_spaces(made)
         # All settings are in the file, so that its mode need not be known for this environment.
-        settings = {"config": stored.config, **stored.dims, **overrides}
+        console = {"verbose": stored.verbose, "tensorboard_log": stored.tensorboard_log}
+        settings = {"config": stored.config, **stored.dims, **console, **overrides}
         task: dict[str, Any] = {"reward_fn": reward_fn, "termination_fn": termination_fn}
         agent = cls(made, **task, device=device, pretrained=False, **settings)
         agent.mode, agent.num_timesteps, agent._episode_num = stored.mode, stored.num_timesteps, stored.episodes
@@ -841,8 +920,57 @@ class ModelBasedAgent(BaseAlgorithm):
         names = [name for name in different_arguments(env, self._env_spec) if name not in task]
         return [f"environment ({', '.join(names)})"] if names else []
 
+    def get_parameters(self) -> dict[str, dict[str, Any]]:
+        """Returns the weights of each network by its name, ``"dynamics"`` first; nothing before it has learnt any."""
+        return parameters_of(self.policy.world)
+
+    @torch.inference_mode(mode=False)
+    def set_parameters(  # type: ignore[override]
+        self, load_path_or_dict: File | Parameters, exact_match: bool = True, device: torch.device | str = "auto"
+    ) -> None:
+        """Takes weights, and forgets what was believed of robots with others; all of them are taken, or none.
+
+        Args:
+            load_path_or_dict: A file that :meth:`save` wrote, or what :meth:`get_parameters` returns.
+            exact_match: Whether all networks and all of their weights must be given.
+            device: Accepted as in Stable-Baselines3; the weights go to the agent's own device.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: The file is damaged or of another kind of agent; a network is unknown or missing; or the weights
+                do not fit the settings.
+        """
+        if isinstance(load_path_or_dict, Mapping):
+            given, situations = load_path_or_dict, self.situations or self._names_for(load_path_or_dict)
+        else:
+            stored = Checkpoint.read(load_path_or_dict)
+            stored.check_agent(type(self).__name__, has_reward_fn=True, has_termination_fn=True)
+            given, situations = stored.weights(), stored.situations
+        self.policy.world = with_parameters(self.policy, given, situations, exact_match)
+        self.forget()
+
+    def _names_for(self, parameters: Parameters) -> tuple[str, ...]:
+        """What the situations of an agent without a model are called, whose weights are given without any names."""
+        embeddings = parameters.get("dynamics", {}).get("embeddings")
+        n = 1 if embeddings is None else embeddings.shape[1]
+        named = self.env is not None and env_attribute(self.env, "training_situations", ())
+        names = tuple(self.situation_envs().situations) if named else ()
+        return names if len(names) == n else tuple(f"situation {i}" for i in range(n))
+
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ([] if self.policy.world is None else ["dynamics"]), []
+        return list(self.get_parameters()), []
+
+
+def _check_policy(env: object, policy: object) -> None:
+    """Refuses a policy that the agent does not have.
+
+    Raises:
+        ValueError: It is another than an MLP, or it is given where the environment belongs.
+    """
+    if isinstance(env, str) and env.endswith("Policy"):
+        raise ValueError(f"The environment comes first, and a policy may follow by name: (env, policy={env!r}).")
+    if policy not in (None, "MlpPolicy"):
+        raise ValueError(f"policy must be 'MlpPolicy' or None, got {policy!r}: the agent plans, and learns no other.")
 
 
 def _description(env: VecEnv) -> dict[str, Any] | None:
@@ -851,6 +979,9 @@ def _description(env: VecEnv) -> dict[str, Any] | None:
     Raises:
         ValueError: It normalises observations.
     """
-    if unwrap_vec_normalize(env) is not None:
-        raise ValueError("The model normalises by itself; give the environment without VecNormalize.")
+    if (normalised := unwrap_vec_normalize(env)) is not None and normalised.norm_obs:
+        raise ValueError(
+            "The model normalises observations by itself: give VecNormalize(env, norm_obs=False), or the environment "
+            "without VecNormalize."
+        )
     return env_spec(env)

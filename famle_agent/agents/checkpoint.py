@@ -7,7 +7,8 @@ import json
 import os
 import zipfile
 import zlib
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Any, BinaryIO
@@ -33,6 +34,11 @@ _DAMAGE = (
     *(zipfile.BadZipFile, zlib.error, EOFError, KeyError, SafetensorError),
     *(ValueError, RuntimeError, NotImplementedError),  # what zipfile and json make of flipped bits
 )
+_OPTIONAL: Mapping[str, Any] = {
+    **dict.fromkeys(("env", "seed", "live", "tensorboard_log")),
+    **dict.fromkeys(("num_timesteps", "episodes", "verbose"), 0),
+}
+"""What a file can go without, and what stands in its place."""
 _META, _TENSORS = "agent.json", "tensors.safetensors"
 
 File = str | os.PathLike[str] | BinaryIO
@@ -120,6 +126,8 @@ class Checkpoint:
         episodes: Episodes that it has lived on robots.
         live: The counts of its online state; None where it has none.
         tensors: Its weights, its online state and its random numbers, as "part/name".
+        verbose: How much it prints.
+        tensorboard_log: Its folder for TensorBoard.
     """
 
     kind: str
@@ -137,6 +145,8 @@ class Checkpoint:
     episodes: int
     live: dict[str, int] | None
     tensors: dict[str, Tensor]
+    verbose: int = 0
+    tensorboard_log: str | None = None
 
     def write(self, file: File) -> None:
         """Writes the file, see :func:`write_checkpoint`."""
@@ -154,6 +164,8 @@ class Checkpoint:
             "seed": self.seed,
             "num_timesteps": self.num_timesteps,
             "episodes": self.episodes,
+            "verbose": self.verbose,
+            "tensorboard_log": self.tensorboard_log,
             "live": self.live,
         }
         write_checkpoint(file, meta, self.tensors)
@@ -186,6 +198,8 @@ class Checkpoint:
                 episodes=int(meta.get("episodes", 0)),
                 live=meta["live"],
                 tensors=tensors,
+                verbose=int(meta.get("verbose", 0)),
+                tensorboard_log=meta.get("tensorboard_log"),
             )
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(
@@ -197,6 +211,36 @@ class Checkpoint:
         """The tensors of one part of the agent, by name; empty where it has none."""
         prefix = f"{name}/"
         return {key.removeprefix(prefix): value for key, value in self.tensors.items() if key.startswith(prefix)}
+
+    def weights(self) -> dict[str, dict[str, Tensor]]:
+        """The weights of each network by its name."""
+        names = {key.split("/")[0] for key in self.tensors} - {"live", "generator"}
+        return {name: self.part(name) for name in sorted(names)}
+
+    def without(self, exclude: Iterable[str], include: Iterable[str] = ()) -> Checkpoint:
+        """Returns the same without some of it; names that no file holds change nothing.
+
+        Args:
+            exclude: Names of attributes, and ``"generator"``.
+            include: What stays although it is in ``exclude``.
+
+        Raises:
+            ValueError: No agent can be made without what is excluded, or no file holds what is included.
+        """
+        exclude, include = set(exclude), set(include)
+        needed = {field.name for field in fields(self)} - _OPTIONAL.keys() | {"tensors", "dynamics"}
+        if unknown := sorted(include - needed - _OPTIONAL.keys() - {"generator"}):
+            raise ValueError(f"A file holds JSON and tensors alone, and can hold no {', '.join(unknown)}.")
+        exclude -= include
+        if lost := sorted(exclude & needed):
+            raise ValueError(f"No agent could be loaded without its {', '.join(lost)}; do not exclude that.")
+        kept = {key: value for key, value in self.tensors.items() if key.split("/")[0] not in exclude}
+        return replace(self, tensors=kept, **{name: _OPTIONAL[name] for name in exclude & _OPTIONAL.keys()})
+
+    def replaced_by(self, objects: Mapping[str, Any]) -> dict[str, Any]:
+        """Those of some objects that stand for something that the file holds or names."""
+        known = self.config.to_dict().keys() | {"seed", "verbose", "tensorboard_log", "reward_fn", "termination_fn"}
+        return {name: value for name, value in objects.items() if name in known}
 
     def model_alone(self) -> Checkpoint:
         """Returns the same with the weights only: no online state, and no random numbers."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import fields
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import RecordConstructorArgs
 
 from famle_agent.agents.agent import ModelBasedAgent
@@ -19,6 +21,21 @@ from famle_agent.data.watch import Watch
 __all__ = ["FAMLEWrapper"]
 
 Array = npt.NDArray[Any]
+
+
+class _SpecWithAgent(EnvSpec):
+    """What an environment is made of, an agent included."""
+
+    def to_json(self) -> str:
+        """Refuses.
+
+        Raises:
+            TypeError: Always, since the weights of an agent are no JSON.
+        """
+        raise TypeError(
+            "The spec of a FAMLEWrapper holds its agent, which is no JSON: store env.env.spec.to_json() and "
+            "agent.save(path), and make it of both, FAMLEWrapper(gym.make(spec), FAMLE.load(path))."
+        )
 
 
 class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArgs):
@@ -52,6 +69,17 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
         self._obs: Array | None = None  # None too where nobody knows where the robot is
         self._begun = False
         self._calls = self._resets = 0
+
+    @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+        """What ``gymnasium.make`` makes the same of, with the same agent; no JSON holds that."""
+        known = super().spec
+        if known is None or isinstance(known, _SpecWithAgent):
+            return known
+        self._cached_spec = _SpecWithAgent(
+            **{item.name: getattr(known, item.name) for item in fields(known) if item.init}
+        )
+        return self._cached_spec
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Resets the environment; the agent's plan is void, its memory stays."""

@@ -29,6 +29,7 @@ Runs = Mapping[str, Sequence[Rollout]]
 """The episodes of each agent, by its name."""
 
 _FILM_FPS = 10.0
+_STEPS_BETWEEN_LINES = 100
 
 
 @dataclass(frozen=True)
@@ -77,13 +78,15 @@ def run_demo(
         check_writable(out / "agent.zip")
         env.reset(seed=seed)
         env.render()
-        label = env.get_wrapper_attr("situation").label
+        broken = str(env.get_wrapper_attr("situation"))
+        console.print(Text(f"The {robot} breaks {_when(shown)}: {broken}."))
         agents = _with_and_without_adaptation(robot, seed, out, settings, console)
         runs: dict[str, list[Rollout]] = {}
         for name, agent in agents.items():
-            with console.status(f"Running {name} ..."):
-                runs[name] = _run(agent, env, situation, shown, seed, out / "tensorboard" / name.replace(" ", "_"))
-        console.print(_table(runs, f"{robot}: {label}"))
+            console.print(Text(f"Running {name}."))
+            log = out / "tensorboard" / name.replace(" ", "_")
+            runs[name] = _run(agent, env, situation, shown, seed, log, console)
+        console.print(_table(runs, robot, broken))
         shown.picture(runs, env, out)
         films = {name: [frame for run in episodes for frame in run.frames] for name, episodes in runs.items()}
         (out / "robot.gif").write_bytes(encode_gif(side_by_side(films), _film_rate(env)))
@@ -128,7 +131,20 @@ def _with_and_without_adaptation(
     return {"with adaptation": agent, "without adaptation": FAMLE.load(out / "agent.zip", adapt_every=0)}
 
 
-def _run(agent: FAMLE, env: gym.Env[Any, Any], situation: str, shown: Demo, seed: int, log: Path) -> list[Rollout]:
+def _when(shown: Demo) -> str:
+    episode, step = shown.breaks_at
+    return f"before step {step} of episode {episode}" if step else f"before episode {episode}"
+
+
+def _run(
+    agent: FAMLE,
+    env: gym.Env[Any, Any],
+    situation: str,
+    shown: Demo,
+    seed: int,
+    log: Path,
+    console: Console,
+) -> list[Rollout]:
     """Runs the episodes of one agent, and logs each step, each episode and the film of the last one."""
     agent.set_random_seed(seed)
     env.unwrapped.set_situation(None)  # type: ignore[attr-defined]
@@ -137,9 +153,10 @@ def _run(agent: FAMLE, env: gym.Env[Any, Any], situation: str, shown: Demo, seed
     for episode in range(shown.episodes):
         breaks_at = shown.breaks_at[1] if episode == shown.breaks_at[0] else None
         filmed = film_every if episode in (0, shown.breaks_at[0], shown.episodes - 1) else 0
-        on_step = _step_logger(logger, agent, done)
+        on_step = _step_logger(logger, wrapped, done, console)
         runs.append(rollout(wrapped, seed if episode == 0 else None, situation, breaks_at, filmed, on_step))
         done += runs[-1].steps
+        console.print(Text(f"  episode {episode}: {_outcome(runs[-1])}. {_belief_and_truth(wrapped)}"))
         logger.record("episode/return", runs[-1].total)
         logger.dump(done)
     log_gif(logger, "robot/last_episode", runs[-1].frames, _film_rate(env), done)
@@ -147,14 +164,20 @@ def _run(agent: FAMLE, env: gym.Env[Any, Any], situation: str, shown: Demo, seed
     return runs
 
 
-def _step_logger(logger: Logger, agent: FAMLE, first: int) -> Callable[[int, float], None]:
+def _step_logger(logger: Logger, env: FAMLEWrapper, first: int, console: Console) -> Callable[[int, float], None]:
     def on_step(step: int, reward: float) -> None:
         logger.record("step/reward", reward)
-        log_posterior(logger, agent.marginals())
-        log_adaptations(logger, agent.belief)
+        log_posterior(logger, env.agent.marginals())
+        log_adaptations(logger, env.agent.belief)
         logger.dump(first + step)
+        if (step + 1) % _STEPS_BETWEEN_LINES == 0:
+            console.print(Text(f"  step {step + 1}. {_belief_and_truth(env)}"))
 
     return on_step
+
+
+def _belief_and_truth(env: FAMLEWrapper) -> str:
+    return f"Belief: {env.agent.diagnose()} Truth: {env.get_wrapper_attr('situation')}."
 
 
 def _film_rate(env: gym.Env[Any, Any]) -> float:
@@ -162,14 +185,17 @@ def _film_rate(env: gym.Env[Any, Any]) -> float:
     return min(_FILM_FPS, max(4.0, 1.0 / float(env.get_wrapper_attr("control_period"))))
 
 
-def _table(runs: Runs, title: str) -> Table:
-    """One row an episode; one that the robot breaks in has two, with the return of 1,000 steps at that rate."""
-    table = Table("episode", *(f"return {name}" for name in runs), "believes at the end", "per step", title=Text(title))
+def _table(runs: Runs, robot: str, broken: str) -> Table:
+    """One row an episode; of one that the robot breaks in, the rewards of a step before and after."""
+    returns, title = [f"return {name}" for name in runs], Text(f"{robot}: {broken}")
+    table = Table("episode", *returns, "truth at the end", "believes at the end", "per step", title=title)
     adapting = next(iter(runs.values()))
+    breaks_in = next(i for i, run in enumerate(adapting) if run.breaks_at is not None)
     for i, run in enumerate(adapting):
+        truth = broken if i >= breaks_in else "intact"
         cells = [_outcome(episodes[i]) for episodes in runs.values()]
         milliseconds = f"{1e3 * np.median(run.step_seconds):.0f} ms"
-        table.add_row(str(i), *cells, Text(f"{run.situations[-1]} ({run.probability:.0%})"), milliseconds)
+        table.add_row(str(i), *cells, Text(truth), Text(f"{run.situations[-1]} ({run.probability:.0%})"), milliseconds)
     return table
 
 

@@ -48,4 +48,6 @@ class ActionScale:
 def to_action_space(action: Tensor, space: spaces.Box) -> Array:
     """Actions in [-1, 1], (..., action_dim), as arrays that lie in an action space, rounding included."""
     actions = ActionScale.of(space, action.device).from_unit(action).cpu().numpy()
+    if np.issubdtype(space.dtype, np.integer):
+        actions = np.rint(actions)
     return np.clip(actions.astype(space.dtype), space.low, space.high)

@@ -56,12 +56,30 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
     """
     for name, space in (("observation", observation_space), ("action", action_space)):
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-            raise ValueError(
-                f"The {name} space must be a one-dimensional Box, got {space}. For a dictionary or an image, use "
-                "gymnasium.wrappers.FlattenObservation; discrete actions are not supported."
-            )
-    if not action_space.is_bounded("both"):  # type: ignore[attr-defined]
-        raise ValueError(f"The action space must be bounded, got {action_space}; use gymnasium.wrappers.RescaleAction.")
+            raise ValueError(f"The {name} space must be a one-dimensional Box, got {space}. {_as_box(name, space)}")
+    box: Any = action_space
+    if not box.is_bounded("both"):
+        raise ValueError(
+            f"The action space must be bounded, got {box}. Say which actions are sensible, here those from -1 to 1: "
+            "gymnasium.wrappers.TransformAction(env, lambda a: a, gymnasium.spaces.Box(-1.0, 1.0, "
+            "env.action_space.shape))."
+        )
+
+
+def _as_box(name: str, space: spaces.Space[Any]) -> str:
+    """How an environment gets the space that a dynamics model needs."""
+    if name == "action" and isinstance(space, spaces.Discrete):
+        return (
+            "As they are, discrete actions are not supported; give each a preference, the greatest of which counts: "
+            "gymnasium.wrappers.TransformAction(env, lambda a: env.action_space.start + int(np.argmax(a)), "
+            f"gymnasium.spaces.Box(-1.0, 1.0, ({int(space.n)},)))."
+        )
+    if name == "action":
+        return (
+            "gymnasium.wrappers.TransformAction(env, function, space) makes the environment's actions of those of a "
+            "one-dimensional Box; discrete actions are not supported as they are."
+        )
+    return "For a dictionary or an image, use gymnasium.wrappers.FlattenObservation."
 
 
 def env_id(env: VecEnv) -> str | None:

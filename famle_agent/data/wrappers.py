@@ -80,7 +80,7 @@ _GYMNASIUM: dict[type, Change] = {
 _OF_VECTORS: dict[type, Change] = {
     **dict.fromkeys((VecMonitor, VecVideoRecorder, VecCheckNan), Change.NOTHING),
     **dict.fromkeys((VecFrameStack, VecTransposeImage, VecExtractDictObs), Change.OBSERVATION),
-    VecNormalize: Change.OBSERVATION | Change.REWARD,
+    VecNormalize: Change.OBSERVATION,
 }
 _BY_KIND: tuple[tuple[type, str, Change], ...] = (
     (gym.ObservationWrapper, "observation", Change.OBSERVATION),
@@ -152,8 +152,8 @@ def _of_own_code(kind: type) -> Layer:
 
 def _layer(env: VecEnvWrapper, change: Change) -> Layer:
     if isinstance(env, VecNormalize):
+        # Rewards that are divided by their deviation ask for the same plans.
         change = Change.OBSERVATION if env.norm_obs else Change.NOTHING
-        change |= Change.REWARD if env.norm_reward else Change.NOTHING
     return Layer(type(env).__name__, change)
 
 

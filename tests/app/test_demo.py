@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -9,8 +11,10 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from famle_agent import FAMLE
+from famle_agent.app import demo
 from famle_agent.app.cli import main
 from famle_agent.app.demo import run_demo
+from tests.conftest import QUICK
 
 slow = pytest.mark.slow
 
@@ -42,6 +46,25 @@ def test_demo_of_the_arm_writes_all_it_promises(
     shown = capsys.readouterr().out
     assert "joint 3 dead" in shown
     assert "returns.png" in shown
+
+
+def test_demo_says_in_words_what_broke_and_how_far_it_is(
+    agent_file: Path,
+    tmp_path: Path,
+    tiny_budgets: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(
+        demo, "FAMLE", Mock(load=FAMLE.load, side_effect=lambda *_, **__: FAMLE.load(agent_file, **QUICK))
+    )
+    run_demo(episodes=2, out=tmp_path)
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "The reacher breaks before episode 1: joint 0 reversed, joint 3 dead." in shown
+    for episode, truth in ((0, "intact"), (1, "joint 0 reversed, joint 3 dead")):
+        lines = re.findall(rf"episode {episode}: \S+ in 6 steps\. Belief: .*?\. Truth: {truth}\.", shown)
+        assert len(lines) == 2  # with adaptation and without
+    assert "truth at" in shown
 
 
 @slow

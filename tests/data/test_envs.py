@@ -359,7 +359,7 @@ BOX = spaces.Box(-1, 1, (2,))
         (spaces.Dict({"arm": BOX}), BOX, "FlattenObservation"),
         (spaces.Box(0, 255, (8, 8, 3), np.uint8), BOX, "FlattenObservation"),
         (BOX, spaces.Box(-1, 1, (2, 2)), "one-dimensional"),
-        (BOX, spaces.Box(-np.inf, np.inf, (2,)), "RescaleAction"),
+        (BOX, spaces.Box(-np.inf, np.inf, (2,)), "TransformAction"),
         (BOX, spaces.Box(np.float32([-1, 0]), np.float32([1, np.inf])), "must be bounded"),
     ],
 )
@@ -368,6 +368,27 @@ def test_spaces_that_no_model_predicts_are_refused(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         FAMLE(Odd(observation_space, action_space))
+
+
+@pytest.mark.parametrize(
+    "action_space",
+    [
+        spaces.Box(-np.inf, np.inf, (2,)),
+        spaces.Box(np.float32([-1, 0]), np.float32([1, np.inf])),
+        spaces.Discrete(3),
+        spaces.Discrete(3, start=4),
+    ],
+)
+def test_advice_on_actions_is_code_that_works(action_space: spaces.Space[Any]) -> None:
+    env = Odd(BOX, action_space)
+    with pytest.raises(ValueError, match="not supported|must be bounded") as refused:
+        FAMLE(env, device="cpu")
+    advice = str(refused.value)
+    code = advice[advice.index("gymnasium.wrappers") :].removesuffix(".")
+    wrapped = eval(code, {"env": env, "gymnasium": gym, "np": np})  # the advice itself
+    assert FAMLE(wrapped, device="cpu", reward_fn=lambda s, a, s_next: s[..., 0]).action_space == wrapped.action_space
+    for _ in range(5):
+        assert action_space.contains(wrapped.action(wrapped.action_space.sample()))
 
 
 def test_discrete_actions_of_a_registered_environment_are_refused() -> None:
