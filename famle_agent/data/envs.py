@@ -61,8 +61,8 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
     if not box.is_bounded("both"):
         raise ValueError(
             f"The action space must be bounded, got {box}. Say which actions are sensible, here those from -1 to 1: "
-            "gymnasium.wrappers.TransformAction(env, lambda a: a, gymnasium.spaces.Box(-1.0, 1.0, "
-            "env.action_space.shape))."
+            "gymnasium.wrappers.TransformAction(env, lambda a: a, gymnasium.spaces.Box("
+            "np.maximum(env.action_space.low, -1.0), np.minimum(env.action_space.high, 1.0)))."
         )
 
 

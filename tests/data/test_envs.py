@@ -381,7 +381,7 @@ def test_spaces_that_no_model_predicts_are_refused(
 )
 def test_advice_on_actions_is_code_that_works(action_space: spaces.Space[Any]) -> None:
     env = Odd(BOX, action_space)
-    with pytest.raises(ValueError, match="not supported|must be bounded") as refused:
+    with pytest.raises(ValueError, match=r"not supported|must be bounded") as refused:
         FAMLE(env, device="cpu")
     advice = str(refused.value)
     code = advice[advice.index("gymnasium.wrappers") :].removesuffix(".")
