@@ -29,15 +29,18 @@ from famle_agent import Transitions
 from famle_agent.adaptation.adapters import descend, select
 from famle_agent.adaptation.belief import Belief, Candidates, prior, window_posterior
 from famle_agent.adaptation.memory import Memory
+from famle_agent.agents.presets import known_robots
 from famle_agent.data.collect import collect
 from famle_agent.data.policies import make_held_uniform
 from famle_agent.models.dynamics import Batch, Dynamics
-from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.models.simulator import Simulator
 from famle_envs import Situation
 
 STEPS_AHEAD = 20  # of the long error
 LATER = 300  # transitions after those that are seen
+
+STEPS = known_robots()["ant"].config("ours").adaptation.gradient.inner_loop(0)  # type: ignore[union-attr]
+"""The gradient steps of one adaptation by default."""
 
 CANDIDATES = {"training situations": False, "sums too": True}
 """Whether sums of embeddings are candidates."""
@@ -45,7 +48,7 @@ CANDIDATES = {"training situations": False, "sums too": True}
 ADAPTATIONS = {
     "nearest embedding": (False, 0),
     "sums of embeddings": (True, 0),
-    "and steps on theta and h": (True, 10),
+    "and steps on theta and h": (True, STEPS.steps),
 }
 """Whether sums of embeddings are candidates, and the number of gradient steps."""
 
@@ -151,7 +154,7 @@ def adapted(model: Dynamics, candidates: Candidates, data: Transitions, n: int, 
     log_p = candidates.log_likelihood(model, model.encode(obs, action, next_obs))
     memory = Memory.full(obs, action, next_obs, log_p)
     belief = replace(belief, log_posterior=window_posterior(candidates, memory))
-    inner_loop = InnerLoop(steps, lr=3e-4, embedding_lr=1e-2, optimizer="adam")
+    inner_loop = replace(STEPS, steps=steps)
     return descend(model, select(model, candidates, belief), memory, inner_loop)
 
 

@@ -128,11 +128,14 @@ def _commit() -> str:
     return described.stdout.strip() or "unknown"
 
 
+_FOLDERS = ("--out", "--cache")
+
+
 def _command(argv: Sequence[str]) -> list[str]:
-    """Writes the command line as a user types it, without paths of a machine: of the program, and of the results."""
+    """Writes the command line as a user types it, without paths of a machine: of the program, and of its folders."""
     script, arguments = Path(argv[0]), list(argv[1:])
-    paths = {i + 1 for i, argument in enumerate(arguments) if argument == "--out"}
-    arguments = [a for i, a in enumerate(arguments) if a.split("=")[0] != "--out" and i not in paths]
+    paths = {i + 1 for i, argument in enumerate(arguments) if argument in _FOLDERS}
+    arguments = [a for i, a in enumerate(arguments) if a.split("=")[0] not in _FOLDERS and i not in paths]
     if script.parent.name == "benchmarks":
         return ["python", "-m", f"benchmarks.{script.stem}", *arguments]
     return [script.name, *arguments] if script.suffix != ".py" else ["python", script.name, *arguments]

@@ -61,7 +61,9 @@ def test_missing_and_damaged_tables_are_named(tmp_path: Path) -> None:
             load(path)
 
 
-@pytest.mark.parametrize("out", [["--out", "/somewhere/else"], ["--out=/somewhere/else"], []])
+@pytest.mark.parametrize(
+    "out", [["--out", "/some/where"], ["--out=/some/where"], ["--cache", "/some/where", "--out=/b"], []]
+)
 def test_command_of_a_result_names_no_path_of_a_machine(out: list[str]) -> None:
     argv = ["/a/machine/benchmarks/reacher.py", "--jobs", "1", *out, "--methods", "ppo"]
     origin = provenance(argv)
