@@ -17,7 +17,8 @@ class Diagnosis:
     Attributes:
         situation: The most likely training situation, or ``"a + b"`` for two faults at once.
         probability: How likely it is among all that were trained.
-        error: Errors of its predictions, in those of simulation: about 1 where the robot is as it was trained.
+        error: Errors of its predictions, in those of simulation: about 1 where the robot is as it was trained. It is
+            measured where the posterior is filtered (``hazard``), and is 1 where it is not.
         steps: Transitions that this rests on.
     """
 
