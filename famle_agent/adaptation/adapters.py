@@ -18,6 +18,7 @@ from famle_agent.adaptation.belief import (
     prior,
     systematic_sample,
     unadapted,
+    updated_bias,
     updated_excess,
     window_posterior,
 )
@@ -64,26 +65,25 @@ class EmbeddingAdapter:
         """Judges a transition by theta_meta with each candidate, and by theta* and h* where steps go on from there."""
         transition = self.model.encode(obs[:, None], action[:, None], next_obs[:, None])  # (B, 1, ...)
         residual = self.candidates.residuals(self.model, transition)[:, :, 0]  # (B, P, C, obs_dim)
-        excess = belief.excess.clamp(min=1.0)[:, None, None]  # the noise that was fitted is the least there is
-        log_p = self.model.log_density(residual, excess.sqrt())  # (B, C)
+        log_p = self._log_density(belief, residual)
         own = torch.zeros_like(log_p[:, 0])
         if self.settings.warm_start:
             adapted = self.model.residuals(transition, belief.h, belief.theta)  # (B, P, 1, obs_dim)
-            own = self.model.log_density(adapted, excess.sqrt())[:, 0]
-        squared = residual.square()
-        squared = squared * trust(squared / excess, self.model.degrees_of_freedom)
-        expected = (belief.posterior[:, None, :, None] * squared).sum(dim=2).mean(dim=1)  # (B, obs_dim)
-        power = self.settings.likelihood_power
-        return Evidence(power * log_p, power * own, expected)
+            own = self._log_density(belief, adapted)[:, 0]
+        return Evidence(residual, log_p, own)
 
     def infer(self, memory: Memory, belief: Belief, evidence: Evidence, moved: Tensor) -> Belief:
         """Filters over all transitions where a hazard is set, else takes the likelihood of the last (the paper)."""
         if not isinstance(how := self.settings.evidence, Filter):
             return replace(belief, log_posterior=window_posterior(self.candidates, memory))
-        posterior = filtered_posterior(self.candidates, belief.log_posterior, evidence.log_p, how.hazard)
-        excess = updated_excess(belief.excess, evidence.squared, memory.weight.sum(dim=1))
-        new = replace(belief, log_posterior=posterior, excess=excess)
-        return new.where(moved, belief)
+        fresh = evidence.residual - belief.bias
+        posterior = filtered_posterior(
+            self.candidates, belief.log_posterior, self._log_density(belief, fresh), how.hazard
+        )
+        seen = memory.weight.sum(dim=1)
+        bias = updated_bias(belief.bias, evidence.residual, seen)
+        excess = updated_excess(belief.excess, self._expected_square(belief, fresh), seen)
+        return replace(belief, log_posterior=posterior, bias=bias, excess=excess).where(moved, belief)
 
     def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
         """Selects the most likely embedding (line 6), then takes k gradient steps on theta and h (line 7)."""
@@ -114,6 +114,16 @@ class EmbeddingAdapter:
         """Says how likely each training situation is, alone or as a part of what is wrong."""
         return dict(zip(situations, self.likely(belief)[0].tolist(), strict=True))
 
+    def _log_density(self, belief: Belief, residual: Tensor) -> Tensor:
+        """Computes log p of residuals (B, P, C, obs_dim) with the robot's own noise, (B, C)."""
+        return self.settings.likelihood_power * self.model.log_density(residual, _noise(belief).sqrt())
+
+    def _expected_square(self, belief: Belief, residual: Tensor) -> Tensor:
+        """Squares residuals (B, P, C, obs_dim), by how likely each candidate was before, (B, obs_dim)."""
+        squared = residual.square()
+        squared = squared * trust(squared / _noise(belief), self.model.degrees_of_freedom)
+        return (belief.posterior[:, None, :, None] * squared).sum(dim=2).mean(dim=1)
+
     def _selected(self, belief: Belief) -> Belief:
         return select(self.model, self.candidates, belief, self.settings.posterior_sampling)
 
@@ -138,8 +148,8 @@ class GradientAdapter:
 
     def judge(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> Evidence:
         """Returns zeros: there is one model, and nothing to tell apart."""
-        nothing = obs.new_zeros(len(obs))
-        return Evidence(nothing[:, None], nothing, torch.ones_like(obs))
+        nothing = obs.new_zeros(len(obs), 1)
+        return Evidence(nothing, nothing, nothing[:, 0])
 
     def infer(self, memory: Memory, belief: Belief, evidence: Evidence, moved: Tensor) -> Belief:
         """Returns the belief as it is."""
@@ -166,6 +176,11 @@ class GradientAdapter:
     def marginals(self, belief: Belief, situations: Sequence[str]) -> dict[str, float]:
         """Puts all the probability on the one model that there is."""
         return {_EVERY_SITUATION: 1.0}
+
+
+def _noise(belief: Belief) -> Tensor:
+    """Returns the squared noise of each robot, (B, 1, 1, obs_dim); what was fitted in simulation is the least."""
+    return belief.excess.clamp(min=1.0)[:, None, None]
 
 
 def gradient_steps(model: Dynamics, start: Belief, memory: Memory, settings: Adaptation, seed: int) -> Belief:

@@ -22,6 +22,7 @@ __all__ = [
     "prior",
     "systematic_sample",
     "unadapted",
+    "updated_bias",
     "updated_excess",
     "window_posterior",
 ]
@@ -29,7 +30,8 @@ __all__ = [
 
 _KINDS = (0.4, 0.4, 0.2)  # how likely no fault is, one, and two
 _BELIEVED = 10.0  # transitions for which the noise that was fitted in simulation counts
-_REMEMBERED = 100.0  # and over which the errors of a robot are averaged
+_REMEMBERED = 100.0  # and over which the squares of a robot's errors are averaged
+_LASTING = 10.0  # and those over which an error that lasts is told from what is new in it
 
 
 @dataclass(frozen=True)
@@ -128,14 +130,14 @@ class Evidence:
     """What one transition of each of B robots says.
 
     Attributes:
+        residual: Errors of each candidate in fitted deviations, (B, P, C, obs_dim).
         log_p: Its log-likelihood under each candidate, (B, C).
         own_log_p: And under the adapted model, (B,).
-        squared: Squared errors in fitted deviations, by how likely each candidate was before, (B, obs_dim).
     """
 
+    residual: Tensor
     log_p: Tensor
     own_log_p: Tensor
-    squared: Tensor
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,8 @@ class Belief:
         theta: theta*, in each of the P members of the ensemble, (B, P, ...).
         h: h*, (B, P, embedding_dim).
         log_posterior: Log P(candidate | memory) but for a constant, (B, C).
-        excess: Mean square of the robot's errors in each observed number, in fitted deviations, (B, obs_dim).
+        bias: The part of each candidate's errors that lasts, in fitted deviations, (B, P, C, obs_dim).
+        excess: Mean square of the rest of the robot's errors in each observed number, (B, obs_dim).
         candidate: The candidate with which theta* and h* began, (B,).
         diverged: How many adaptations of each robot left the finite numbers and were taken back, (B,).
         adaptations: How often the robots have adapted.
@@ -155,6 +158,7 @@ class Belief:
     theta: Theta
     h: Tensor
     log_posterior: Tensor
+    bias: Tensor
     excess: Tensor
     candidate: Tensor
     diverged: Tensor
@@ -173,7 +177,7 @@ class Belief:
     def of(self, robot: int) -> Belief:
         """The belief about one robot alone, as of B = 1."""
         theta = {name: value[robot : robot + 1] for name, value in self.theta.items()}
-        names = ("h", "log_posterior", "excess", "candidate", "diverged")
+        names = ("h", "log_posterior", "bias", "excess", "candidate", "diverged")
         return replace(self, theta=theta, **{name: getattr(self, name)[robot : robot + 1] for name in names})
 
     def is_finite(self) -> Tensor:
@@ -187,6 +191,7 @@ class Belief:
             {name: choose(kept, value, other.theta[name]) for name, value in self.theta.items()},
             choose(kept, self.h, other.h),
             choose(kept, self.log_posterior, other.log_posterior),
+            choose(kept, self.bias, other.bias),
             choose(kept, self.excess, other.excess),
             choose(kept, self.candidate, other.candidate),
             choose(kept, self.diverged, other.diverged),
@@ -202,9 +207,9 @@ def prior(model: Dynamics, candidates: Candidates, robots: int) -> Belief:
 def unadapted(model: Dynamics, log_prior: Tensor, robots: int) -> Belief:
     """Returns theta_meta and the first embedding for B robots, with the log prior (C,) of what there is to select."""
     none = torch.zeros(robots, dtype=torch.long, device=model.embeddings.device)
-    log_prior = log_prior.expand(robots, -1)
-    theta, h, excess = model.theta_of(robots), model.embeddings_of(none), log_prior.new_ones(robots, model.obs_dim)
-    return Belief(theta, h, log_prior, excess, candidate=none, diverged=none)
+    bias = log_prior.new_zeros(robots, model.members, len(log_prior), model.obs_dim)
+    theta, h, excess = model.theta_of(robots), model.embeddings_of(none), bias.new_ones(robots, model.obs_dim)
+    return Belief(theta, h, log_prior.expand(robots, -1), bias, excess, candidate=none, diverged=none)
 
 
 def window_posterior(candidates: Candidates, memory: Memory) -> Tensor:
@@ -229,6 +234,21 @@ def filtered_posterior(candidates: Candidates, log_posterior: Tensor, log_p: Ten
     return (torch.logaddexp(stays, candidates.log_prior + math.log(hazard)) + log_p).log_softmax(dim=1)
 
 
+def updated_bias(bias: Tensor, residual: Tensor, seen: Tensor) -> Tensor:
+    """Averages the errors of each candidate over the last ten transitions, (B, P, C, obs_dim).
+
+    A model that is wrong in the same way at each step says so at each step, and a posterior that takes this for as
+    many independent observations becomes sure of whatever candidate happens to balance the error best. What is
+    evidence is how errors change with what the robot does.
+
+    Args:
+        bias: Their mean before.
+        residual: Of the newest transition.
+        seen: How many transitions there were, (B,).
+    """
+    return torch.lerp(bias, residual, (1.0 / seen.clamp(1.0, _LASTING))[:, None, None, None])
+
+
 def updated_excess(excess: Tensor, squared: Tensor, seen: Tensor) -> Tensor:
     """Averages squared errors over what a robot has seen, the newest hundred above all, (B, obs_dim).
 
@@ -251,7 +271,7 @@ def systematic_sample(posterior: Tensor, n: int, offset: float) -> Tensor:
         offset: In [0, 1).
     """
     descending, order = posterior.sort(dim=1, descending=True, stable=True)
-    at = (torch.arange(n, device=posterior.device) + offset) / n
+    at = (torch.arange(n, device=posterior.device, dtype=posterior.dtype) + offset) / n
     index = torch.searchsorted(descending.cumsum(dim=1), at.expand(len(posterior), n).contiguous(), right=True)
     return order.gather(1, index.clamp(max=posterior.shape[1] - 1))
 

@@ -62,7 +62,8 @@ class OnlineState:
         """All but :attr:`last` and the counts, for a checkpoint; files have robots and members in one axis."""
         tensors = {f"theta.{name}": value.flatten(0, 1) for name, value in self.belief.theta.items()}
         tensors |= {f"memory.{name}": value for name, value in vars(self.memory).items()}
-        belief = {name: getattr(self.belief, name) for name in ("log_posterior", "excess", "candidate", "diverged")}
+        names = ("log_posterior", "bias", "excess", "candidate", "diverged")
+        belief = {name: getattr(self.belief, name) for name in names}
         return tensors | belief | {"h": self.belief.h.flatten(0, 1), "plan": self.plan}
 
     @classmethod
@@ -75,10 +76,11 @@ class OnlineState:
         log_posterior, candidate = tensors["log_posterior"], tensors["candidate"]
         diverged = tensors.get("diverged", torch.zeros_like(candidate))  # files of version 0.1 do not count
         excess = tensors.get("excess", torch.ones_like(tensors["memory.obs"][:, 0]))  # nor know of other noise
-        robots = len(candidate)
+        robots, members = len(candidate), len(tensors["h"]) // len(candidate)
+        bias = tensors.get("bias", excess.new_zeros(robots, members, log_posterior.shape[1], excess.shape[1]))
         theta = {name: value.view(robots, -1, *value.shape[1:]) for name, value in part("theta.").items()}
         h = tensors["h"].view(robots, -1, tensors["h"].shape[1])
-        belief = Belief(theta, h, log_posterior, excess, candidate, diverged, adaptations)
+        belief = Belief(theta, h, log_posterior, bias, excess, candidate, diverged, adaptations)
         return cls(Memory(**part("memory.")), belief, tensors["plan"], steps=steps, adapted_at=adapted_at)
 
 

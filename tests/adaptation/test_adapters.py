@@ -174,14 +174,15 @@ def make_belief(value: float, adaptations: int, members: int = 1) -> Belief:
     theta = {"weight_0": torch.full((*axes, 2, 2), value), "bias_0": torch.full((*axes, 2), value)}
     h, log_posterior, candidate = torch.full((*axes, 4), value), torch.full((3, 5), value), torch.full((3,), int(value))
     excess = torch.full((3, 2), value)
-    return Belief(theta, h, log_posterior, excess, candidate, torch.zeros_like(candidate), adaptations)
+    bias = excess[:, None, None].expand(-1, members, log_posterior.shape[1], -1)
+    return Belief(theta, h, log_posterior, bias, excess, candidate, torch.zeros_like(candidate), adaptations)
 
 
 @given(st.lists(st.booleans(), min_size=3, max_size=3), st.integers(1, 3))
 def test_beliefs_are_mixed_by_robot(kept: list[bool], members: int) -> None:
     mixed = make_belief(1.0, 4, members).where(torch.tensor(kept), make_belief(2.0, 0, members))
     expected = [1.0 if keep else 2.0 for keep in kept]
-    for value in (*mixed.theta.values(), mixed.h, mixed.log_posterior, mixed.excess, mixed.candidate[:, None]):
+    for value in (*mixed.theta.values(), mixed.h, mixed.log_posterior, mixed.bias, mixed.excess, mixed.candidate[:, None]):
         assert value.flatten(1).amax(dim=1).tolist() == value.flatten(1).amin(dim=1).tolist() == expected
     assert mixed.adaptations == 4
 

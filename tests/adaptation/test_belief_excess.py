@@ -1,4 +1,4 @@
-"""What a robot's own errors say of the noise, and of whether it is like anything that was trained."""
+"""What a robot's own errors say: what lasts in them, what the noise is, and whether it is like anything known."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from famle_agent import FAMLE
 from famle_agent.adaptation.adapters import EmbeddingAdapter
-from famle_agent.adaptation.belief import Belief, updated_excess
+from famle_agent.adaptation.belief import Belief, updated_bias, updated_excess
 from famle_agent.adaptation.diagnosis import Diagnosis
 from famle_agent.adaptation.memory import Memory
 from famle_agent.adaptation.settings import Adaptation, Filter, Window
@@ -22,8 +22,10 @@ from tests.helpers import random_transitions, simple_model
 FILTER = Adaptation(evidence=Filter(1e-4), gradient=None, compose=True)
 
 
-def seen(model: Dynamics, settings: Adaptation, noise: float, steps: int = 150, robots: int = 2) -> Belief:
-    """What robots of situation 1 believe whose errors are ``noise`` times those that were fitted."""
+def seen(
+    model: Dynamics, settings: Adaptation, noise: float, steps: int = 150, robots: int = 2, lasting: float = 0.0
+) -> Belief:
+    """What robots of situation 1 believe whose errors are ``noise`` times those that were fitted, and last in part."""
     adapter = EmbeddingAdapter(model, settings, seed=0)
     belief, nothing = adapter.initial(robots), torch.ones(robots, dtype=torch.bool)
     C = belief.log_posterior.shape[1]
@@ -33,7 +35,7 @@ def seen(model: Dynamics, settings: Adaptation, noise: float, steps: int = 150, 
     for _ in range(steps):
         obs, action, _ = (values[:, 0] for values in random_transitions(model, robots, 1))
         expected = model.predict(obs[:, None], action[:, None], h).mean(dim=1)[:, 0]
-        error = noise * model.noise_std.mean(dim=0) * torch.randn(obs.shape, generator=generator)
+        error = noise * model.noise_std.mean(dim=0) * (lasting + torch.randn(obs.shape, generator=generator))
         next_obs = expected + error * model.target_std
         evidence = adapter.judge(belief, obs, action, next_obs)
         memory = memory.add(obs, action, next_obs, evidence.log_p, evidence.own_log_p, nothing)
@@ -73,6 +75,42 @@ def test_evidence_shrinks_with_the_square_of_the_noise(times: float, seed: int) 
 def test_window_takes_the_noise_that_was_fitted(model: Dynamics) -> None:
     belief = seen(model, replace(FILTER, evidence=Window(10)), noise=4.0)
     assert (belief.excess == 1.0).all()
+
+
+@torch.no_grad()
+def test_fault_is_named_behind_an_error_that_lasts(model: Dynamics) -> None:
+    belief = seen(model, FILTER, noise=1.0, steps=400, lasting=10.0)
+    assert (belief.posterior.argmax(dim=1) == 1).all()
+    assert (belief.excess.mean(dim=1) < 3.0).all()  # of 100, the square of what lasts
+
+
+@given(st.integers(0, 1000), st.integers(3, 100))
+@torch.no_grad()
+def test_robot_at_rest_does_not_become_sure(seed: int, steps: int) -> None:
+    torch.manual_seed(seed)
+    model = simple_model(n_situations=3)
+    adapter = EmbeddingAdapter(model, FILTER, seed=0)
+    belief, moved = adapter.initial(1), torch.ones(1, dtype=torch.bool)
+    transition = [values[:, 0] for values in random_transitions(model, 1, 1)]
+    memory = Memory.empty(1, 200, model.obs_dim, model.action_dim, 4, torch.device("cpu"), 10)
+    sure = [float(belief.posterior.max())]
+    for _ in range(steps):
+        evidence = adapter.judge(belief, *transition)
+        memory = memory.add(*transition, evidence.log_p, evidence.own_log_p, moved)
+        belief = adapter.infer(memory, belief, evidence, moved)
+        sure.append(float(belief.posterior.max()))
+    assert sure[-1] <= max(sure[:2]) + 1e-5  # what repeats itself is said once
+
+
+@given(st.floats(-1e3, 1e3), st.integers(0, 1000))
+def test_error_that_lasts_is_its_own_mean(value: float, n: int) -> None:
+    lasting = torch.full((1, 1, 2, 3), value)
+    torch.testing.assert_close(updated_bias(lasting, lasting, torch.tensor([float(n)])), lasting)
+
+
+@torch.no_grad()
+def test_window_takes_errors_as_they_are(model: Dynamics) -> None:
+    assert not seen(model, replace(FILTER, evidence=Window(10)), noise=4.0).bias.any()
 
 
 @given(st.floats(0.0, 1e6), st.integers(0, 10_000))
