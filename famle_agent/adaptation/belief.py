@@ -170,9 +170,9 @@ class Belief:
         return torch.softmax(self.log_posterior, dim=1)
 
     @property
-    def error(self) -> float:
-        """Root mean square of the first robot's errors, in deviations that were fitted in simulation."""
-        return float(self.excess[0].mean().sqrt())
+    def errors(self) -> Tensor:
+        """Root mean square of what is new in each robot's errors, in fitted deviations, (B,)."""
+        return self.excess.mean(dim=1).sqrt()
 
     def of(self, robot: int) -> Belief:
         """The belief about one robot alone, as of B = 1."""

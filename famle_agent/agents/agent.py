@@ -278,7 +278,7 @@ class ModelBasedAgent(StoredAgent):
         progress_bar: bool = False,
         n_jobs: int = 1,
         folder: str | os.PathLike[str] | None = None,
-        check: bool | None = None,
+        check: bool = True,
     ) -> Self:
         """Learns in simulation: collects transitions in every situation, then learns the model from them.
 
@@ -298,8 +298,8 @@ class ModelBasedAgent(StoredAgent):
                 this process alone.
             folder: Where transitions are stored as they come, the model after each round, and once a minute how far
                 a round has got. The same call goes on where one that was stopped had got to.
-            check: Whether to compare the agent's planning in simulation with doing nothing and acting at random in the
-                end, and to warn where it is not better. None does so on robots that the package has no settings for.
+            check: Whether to let the agent plan in simulation in the end, to compare it with doing nothing and acting
+                at random, and to warn where it is not better. What its errors are there, a diagnosis takes for usual.
                 The result is in ``last_check``, in TensorBoard, and printed with ``verbose=1``.
 
         Returns:
@@ -343,14 +343,14 @@ class ModelBasedAgent(StoredAgent):
             self.policy.world = known  # a half-learnt model is none
             raise
         hooks.on_training_end()
-        unknown = self.env is not None and robot_of(env_id(self.env)).name == "default"
-        if isinstance(source, SituationEnvs) and (unknown if check is None else check):
+        if isinstance(source, SituationEnvs) and check:
             self._check(source)
         return self
 
     def _check(self, envs: SituationEnvs) -> None:
         """Compares planning in simulation with knowing nothing, and warns where it is not better."""
         found = self.last_check = check_plans(self, envs, self.seed or 0)
+        self.model.usual_error.fill_(float(np.median(found.errors).clip(min=1.0)))
         for name in ("planned", "nothing", "random"):
             self.logger.record(f"check/{name}", float(np.median(getattr(found, name))))
         self.logger.dump(self.num_iterations)
@@ -664,8 +664,8 @@ class ModelBasedAgent(StoredAgent):
         Arguments and errors as of :meth:`posterior`.
         """
         state = self._state_for(state, robot)
-        error, steps = state.belief.of(robot).error, int(state.memory.weight[robot].sum())
-        return Diagnosis.of(self.posterior(state, robot), error, steps)
+        error, steps = state.belief.errors[robot] / self.model.usual_error, int(state.memory.weight[robot].sum())
+        return Diagnosis.of(self.posterior(state, robot), float(error), steps)
 
     def _state_for(self, state: OnlineState | None, robot: int) -> OnlineState:
         state = state or self._live or self.state_of(self.model.robots)

@@ -36,6 +36,7 @@ class Check:
         planned: Of the agent, which is told nothing, (n,).
         nothing: Of actions that are 0, or the nearest to it, (n,).
         random: Of actions at random, (n,).
+        errors: Of the agent's predictions in the end, see :attr:`~famle_agent.adaptation.belief.Belief.errors`, (n,).
         steps: How long an episode lasted at most.
     """
 
@@ -43,6 +44,7 @@ class Check:
     planned: Array
     nothing: Array
     random: Array
+    errors: Array
     steps: int
 
     @property
@@ -72,10 +74,12 @@ def check_plans(agent: Plans, envs: SituationEnvs, seed: int, steps: int = 200, 
     made = [source if isinstance(source, gym.Env) else source() for source in sources]
     space: Any = made[0].action_space
     rng, shape, state = np.random.default_rng(seed), (len(made), *space.shape), None
+    errors = np.ones(len(made))
 
     def plan(obs: Array) -> Array:
-        nonlocal state
+        nonlocal errors, state
         action, state = agent.predict(obs, state, deterministic=True)
+        errors = state.belief.errors.cpu().numpy()
         return np.asarray(action)
 
     try:
@@ -86,7 +90,7 @@ def check_plans(agent: Plans, envs: SituationEnvs, seed: int, steps: int = 200, 
         for env, source in zip(made, sources, strict=True):
             if env is not source:
                 env.close()
-    return Check(tuple(envs.situations[i] for i in chosen), planned, nothing, random, steps)
+    return Check(tuple(envs.situations[i] for i in chosen), planned, nothing, random, errors, steps)
 
 
 def _returns(envs: Sequence[gym.Env[Any, Any]], act: Callable[[Array], Array], seed: int, steps: int) -> Array:

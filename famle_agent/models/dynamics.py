@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -74,6 +74,8 @@ class Dynamics(nn.Module):
         theta: Parameters by name, (R * P, ...); :meth:`theta_of` gives them with axes of their own.
         embeddings: H, the embedding of each training situation, (R * P, N, embedding_dim).
         noise_std: Deviations of the targets from the mean, (R * P, obs_dim).
+        usual_error: Root mean square, in these deviations, of what is new in the errors on robots of known situations
+            that the agent drives, (). Above 1 where it drives them to places that its data hold little of.
     """
 
     input_mean: Tensor
@@ -83,6 +85,7 @@ class Dynamics(nn.Module):
     target_mean: Tensor
     target_std: Tensor
     noise_std: Tensor
+    usual_error: Tensor
 
     def __init__(
         self,
@@ -130,6 +133,11 @@ class Dynamics(nn.Module):
             self.register_buffer(f"{name}_mean", torch.zeros(size, dtype=torch.float32), persistent=kept)
             self.register_buffer(f"{name}_std", torch.ones(size, dtype=torch.float32), persistent=kept)
         self.register_buffer("noise_std", torch.ones(networks, obs_dim, dtype=torch.float32))
+        self.register_buffer("usual_error", torch.ones((), dtype=torch.float32))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        state_dict.setdefault(f"{prefix}usual_error", torch.ones_like(self.usual_error))  # older files have none
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @property
     def n_situations(self) -> int:
