@@ -182,7 +182,14 @@ def make_belief(value: float, adaptations: int, members: int = 1) -> Belief:
 def test_beliefs_are_mixed_by_robot(kept: list[bool], members: int) -> None:
     mixed = make_belief(1.0, 4, members).where(torch.tensor(kept), make_belief(2.0, 0, members))
     expected = [1.0 if keep else 2.0 for keep in kept]
-    for value in (*mixed.theta.values(), mixed.h, mixed.log_posterior, mixed.bias, mixed.excess, mixed.candidate[:, None]):
+    for value in (
+        *mixed.theta.values(),
+        mixed.h,
+        mixed.log_posterior,
+        mixed.bias,
+        mixed.excess,
+        mixed.candidate[:, None],
+    ):
         assert value.flatten(1).amax(dim=1).tolist() == value.flatten(1).amin(dim=1).tolist() == expected
     assert mixed.adaptations == 4
 
