@@ -77,10 +77,8 @@ class EmbeddingAdapter:
         if not isinstance(how := self.settings.evidence, Filter):
             return replace(belief, log_posterior=window_posterior(self.candidates, memory))
         fresh = evidence.residual - belief.bias
-        posterior = filtered_posterior(
-            self.candidates, belief.log_posterior, self._log_density(belief, fresh), how.hazard
-        )
-        seen = memory.weight.sum(dim=1)
+        log_p, seen = self._log_density(belief, fresh), memory.weight.sum(dim=1)
+        posterior = filtered_posterior(self.candidates, belief.log_posterior, log_p, how.hazard)
         bias = updated_bias(belief.bias, evidence.residual, seen)
         excess = updated_excess(belief.excess, self._expected_square(belief, fresh), seen)
         return replace(belief, log_posterior=posterior, bias=bias, excess=excess).where(moved, belief)
@@ -89,7 +87,7 @@ class EmbeddingAdapter:
         """Selects the most likely embedding (line 6), then takes k gradient steps on theta and h (line 7)."""
         start = self._selected(belief)
         if self.settings.warm_start:
-            changed = memory.better_explained(start.candidate) & (start.candidate != belief.candidate)
+            changed = self._has_changed(memory, start.candidate) & (start.candidate != belief.candidate)
             memory = memory.begun_anew(changed, start.candidate)
             start = start.where(changed, replace(belief, adaptations=start.adaptations))
         return memory, gradient_steps(self.model, start, memory, self.settings, self.seed)
@@ -123,6 +121,16 @@ class EmbeddingAdapter:
         squared = residual.square()
         squared = squared * trust(squared / _noise(belief), self.model.degrees_of_freedom)
         return (belief.posterior[:, None, :, None] * squared).sum(dim=2).mean(dim=1)
+
+    def _has_changed(self, memory: Memory, candidate: Tensor) -> Tensor:
+        """Says where a candidate (B,) explains what was seen, or the newest of it, better than what was believed, (B,).
+
+        The second is the test of a change point by cumulative sums: of a robot that has just broken, most of the memory
+        still speaks for what it was.
+        """
+        how, gain = self.settings.evidence, memory.gain(candidate)
+        surprise = how.surprise if isinstance(how, Filter) else math.inf
+        return (gain[:, 0] > 0.0) | (gain.amax(dim=1) > surprise)
 
     def _selected(self, belief: Belief) -> Belief:
         return select(self.model, self.candidates, belief, self.settings.posterior_sampling)

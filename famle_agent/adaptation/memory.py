@@ -111,8 +111,7 @@ class Memory:
             rows: Which robots do, (B,).
             candidate: What they believe from now on, and as if they had believed it in these transitions, (B,).
         """
-        explained = self.explained_by(candidate)
-        gain = ((explained - self.own_log_p) * self.judging).flip(1).cumsum(dim=1).flip(1)  # from each on, (B, W)
+        explained, gain = self.explained_by(candidate), self.gain(candidate)
         age = torch.arange(self.weight.shape[1], 0, -1, device=gain.device)
         kept = age <= gain.shape[1] - gain.argmax(dim=1, keepdim=True)  # (B, M)
         weight = torch.where(rows[:, None], self.weight * kept, self.weight)
@@ -124,7 +123,11 @@ class Memory:
 
         Both are judged by transitions that no gradient step had seen when they were made.
         """
-        return ((self.explained_by(candidate) - self.own_log_p) * self.judging).sum(dim=1) > 0.0
+        return self.gain(candidate)[:, 0] > 0.0
+
+    def gain(self, candidate: Tensor) -> Tensor:
+        """By how much a candidate (B,) explains the transitions from each of the newest W on better, (B, W)."""
+        return ((self.explained_by(candidate) - self.own_log_p) * self.judging).flip(1).cumsum(dim=1).flip(1)
 
     def explained_by(self, candidate: Tensor) -> Tensor:
         """The log-likelihood of the newest W transitions under a candidate for each robot (B,), (B, W)."""

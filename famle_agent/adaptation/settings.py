@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -37,6 +38,11 @@ class Filter:
     def __post_init__(self) -> None:
         if not 0.0 < self.hazard < 1.0:
             raise ValueError(f"hazard is a probability above 0 and below 1, got {self.hazard!r}.")
+
+    @property
+    def surprise(self) -> float:
+        """-log(hazard), what the evidence for a change has to outweigh."""
+        return -math.log(self.hazard)
 
 
 @dataclass(frozen=True)

@@ -206,3 +206,14 @@ def test_agent_that_goes_on_is_saved_with_what_it_knows(load: Load, data: Transi
     torch.testing.assert_close(agent.belief.h, loaded.belief.h)
     assert torch.equal(agent.belief.candidate, loaded.belief.candidate)
     loaded.get_env().close()
+
+
+def test_filtering_robot_that_breaks_late_begins_anew_with_what_it_went_through_since(
+    load: Load, data: Transitions
+) -> None:
+    agent = load(hazard=1e-3, selection_size=0, memory_size=100)
+    tell(agent, data, [DEAD], range(60))
+    assert agent.belief.candidate.tolist() == [DEAD]
+    tell(agent, data, [REVERSED], range(60, 90))
+    assert agent.belief.candidate.tolist() == [REVERSED]
+    assert memory(agent).seen <= 30  # of 90, most of which speak for the old situation
