@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from famle_agent.agents.famle import FAMLE
     from famle_agent.agents.wrapper import FAMLEWrapper
     from famle_agent.data.transitions import Transitions
-    from famle_agent.utils.errors import NotLearnedError
+    from famle_agent.utils.errors import NotLearnedError, SensorError
 
 __all__ = [
     "AMPC",
@@ -28,6 +28,7 @@ __all__ = [
     "ModelBasedAgent",
     "NotLearnedError",
     "OnlineState",
+    "SensorError",
     "Transitions",
     "__version__",
 ]
@@ -44,6 +45,7 @@ _MODULES = {
     "Hyperparameters": "agents.config",  # deprecated
     "NotLearnedError": "utils.errors",
     "OnlineState": "adaptation.controller",
+    "SensorError": "utils.errors",
     "Transitions": "data.transitions",
 }
 

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from famle_agent.utils.deadline import Deadline
+
 __all__ = ["ICEM", "MPPI", "Judge", "Planner", "RandomShooting", "shift"]
 
 Judge = Callable[[Tensor], Tensor]
@@ -33,7 +35,12 @@ class Planner(ABC):
 
     @abstractmethod
     def plan(
-        self, judge: Judge, start: Tensor, generator: torch.Generator, proposals: Tensor | None = None
+        self,
+        judge: Judge,
+        start: Tensor,
+        generator: torch.Generator,
+        proposals: Tensor | None = None,
+        deadline: Deadline | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Plans for B robots.
 
@@ -42,6 +49,7 @@ class Planner(ABC):
             start: The plan to begin from, (B, H, action_dim): zeros, or the last plan moved on by one step.
             generator: Source of all the chance, on the device of ``start``.
             proposals: Plans that somebody else has made, (B, M, H, action_dim), which compete.
+            deadline: By when to return the best plan so far; there is one after the first iteration.
 
         Returns:
             The action to apply now, (B, action_dim), and the whole plan, (B, H, action_dim).
@@ -50,10 +58,18 @@ class Planner(ABC):
 
 @dataclass(frozen=True)
 class RandomShooting(Planner):
-    """The paper's planner: the best of N uniformly random sequences (Rao, 2009). It starts anew each time."""
+    """The paper's planner: the best of N uniformly random sequences (Rao, 2009). It starts anew each time.
+
+    It has a single iteration, which no deadline ends.
+    """
 
     def plan(
-        self, judge: Judge, start: Tensor, generator: torch.Generator, proposals: Tensor | None = None
+        self,
+        judge: Judge,
+        start: Tensor,
+        generator: torch.Generator,
+        proposals: Tensor | None = None,
+        deadline: Deadline | None = None,
     ) -> tuple[Tensor, Tensor]:
         """See :meth:`Planner.plan`."""
         shape = (len(start), self.candidates, *start.shape[1:])
@@ -86,7 +102,12 @@ class ICEM(Planner):
     keep_fraction: float = 0.3
 
     def plan(
-        self, judge: Judge, start: Tensor, generator: torch.Generator, proposals: Tensor | None = None
+        self,
+        judge: Judge,
+        start: Tensor,
+        generator: torch.Generator,
+        proposals: Tensor | None = None,
+        deadline: Deadline | None = None,
     ) -> tuple[Tensor, Tensor]:
         """See :meth:`Planner.plan`."""
         mean, std = start, torch.full_like(start, self.init_std)
@@ -97,6 +118,8 @@ class ICEM(Planner):
             mean = elites[:, 0]
         keep = max(1, int(self.keep_fraction * self.elites))
         for _ in range(self.iterations):
+            if deadline is not None and not deadline.leaves_time():
+                break
             noise = coloured_noise(start, self.candidates, self.noise_beta, generator)
             tau = (mean[:, None] + std[:, None] * noise).clamp(-1.0, 1.0)
             tau = torch.cat([tau, elites[:, :keep], mean[:, None]], dim=1)
@@ -125,11 +148,18 @@ class MPPI(Planner):
     noise_beta: float = 2.0
 
     def plan(
-        self, judge: Judge, start: Tensor, generator: torch.Generator, proposals: Tensor | None = None
+        self,
+        judge: Judge,
+        start: Tensor,
+        generator: torch.Generator,
+        proposals: Tensor | None = None,
+        deadline: Deadline | None = None,
     ) -> tuple[Tensor, Tensor]:
         """See :meth:`Planner.plan`."""
         mean = start
         for _ in range(self.iterations):
+            if deadline is not None and not deadline.leaves_time():
+                break
             noise = self.init_std * coloured_noise(start, self.candidates, self.noise_beta, generator)
             tau = torch.cat([mean[:, None], (mean[:, None] + noise).clamp(-1.0, 1.0)], dim=1)
             tau = tau if proposals is None else torch.cat([tau, proposals], dim=1)

@@ -15,9 +15,11 @@ from torch import Tensor
 from famle_agent.adaptation.belief import Belief, Evidence
 from famle_agent.adaptation.guide import Guide
 from famle_agent.adaptation.memory import Memory
+from famle_agent.adaptation.senses import Senses
 from famle_agent.models.reward import Objective
 from famle_agent.models.simulator import Simulator
 from famle_agent.planning import Planner, shift
+from famle_agent.utils.deadline import Deadline
 
 __all__ = ["Adapter", "Controller", "OnlineState"]
 
@@ -32,8 +34,10 @@ class OnlineState:
         plan: Where the next search for actions begins, (B, H, action_dim).
         last: The observation and the action of the last step, (B, obs_dim) and (B, action_dim); None where
             somebody else reports the transitions.
-        steps: Steps on which at least one robot had a transition.
+        steps: Steps, of a single robot those on which it had a transition. Of several robots all count, since none may
+            change when the others adapt.
         adapted_at: How many of them there were when the robots last adapted at the end of an episode.
+        senses: What the robots' sensors have said last; None where nobody has asked. No file holds it.
     """
 
     memory: Memory
@@ -42,6 +46,7 @@ class OnlineState:
     last: tuple[Tensor, Tensor] | None = None
     steps: int = 0
     adapted_at: int = 0
+    senses: Senses | None = None
 
     @property
     def robots(self) -> int:
@@ -152,7 +157,7 @@ class Controller:
             return state
         evidence, belief = self.adapter.judge(state.belief, *state.last, obs), state.belief
         memory = state.memory.add(*state.last, obs, evidence.log_p, evidence.own_log_p, valid=~starts)
-        if starts.all():
+        if starts.all() and state.robots == 1:
             return replace(state, last=None)
         steps = state.steps + 1
         if self.adapt_every or self.adapt_at_reset:
@@ -163,18 +168,24 @@ class Controller:
 
     @torch.no_grad()
     def act(
-        self, state: OnlineState, obs: Tensor, starts: Tensor, generator: torch.Generator
+        self,
+        state: OnlineState,
+        obs: Tensor,
+        starts: Tensor,
+        generator: torch.Generator,
+        deadline: Deadline | None = None,
     ) -> tuple[Tensor, OnlineState]:
-        """Plans an action in [-1, 1], (B, action_dim), with the adapted model (line 8)."""
+        """Plans an action in [-1, 1], (B, action_dim), with the adapted model (line 8) and by the deadline, if any."""
         state = self.reset(state, starts)
         model = self.adapter.model_for(state.belief, state.memory)
         objective, proposals = self.objective, None
+        in_time = () if deadline is None else (deadline,)  # a planner of a user may know of none
         if self.guide is not None:
             likely = self.adapter.likely(state.belief)
             proposals = self.guide.proposals(model, obs, likely, self.planner.horizon, generator)
             objective = self.guide.looking_beyond(objective, likely, model.members)
         action, plan = self.planner.plan(
-            lambda tau: model.returns(objective, obs, tau), state.plan, generator, proposals
+            lambda tau: model.returns(objective, obs, tau), state.plan, generator, proposals, *in_time
         )
         return action, replace(state, plan=shift(plan), last=(obs, action))
 

@@ -25,14 +25,17 @@ from famle_agent.adaptation.adapters import EmbeddingAdapter, GradientAdapter
 from famle_agent.adaptation.belief import Belief
 from famle_agent.adaptation.controller import Adapter, Controller, OnlineState
 from famle_agent.adaptation.diagnosis import Diagnosis
+from famle_agent.adaptation.perception import Perception
+from famle_agent.adaptation.senses import Senses
 from famle_agent.agents.check import Check, check_plans
 from famle_agent.agents.config import Config
+from famle_agent.agents.keywords import SAFETY
 from famle_agent.agents.logs import console_for_bars, log_episodes, log_time
 from famle_agent.agents.meta_training import meta_train, planning_policy, simulate
 from famle_agent.agents.policy import AdaptivePolicy
 from famle_agent.agents.presets import make_env, robot_of
 from famle_agent.agents.stored_agent import StoredAgent
-from famle_agent.agents.tensorboard import log_adaptations, log_embeddings, log_posterior
+from famle_agent.agents.tensorboard import log_adaptations, log_embeddings, log_health, log_posterior
 from famle_agent.agents.world_model import Interface
 from famle_agent.data.action_scaling import to_action_space
 from famle_agent.data.envs import (
@@ -47,7 +50,7 @@ from famle_agent.data.envs import (
     situation_envs,
     special_dims,
 )
-from famle_agent.data.gate import check_action, check_observation, vec_observations, vec_step
+from famle_agent.data.gate import check_action, reading, vec_readings, vec_step
 from famle_agent.data.policies import MakePolicy, reward_names
 from famle_agent.data.probe import check_reward_fn, check_termination_fn
 from famle_agent.data.transitions import Transitions, check_names
@@ -56,6 +59,8 @@ from famle_agent.models.gradient_steps import prepare_torch
 from famle_agent.models.reward import RewardFn, TerminationFn
 from famle_agent.training.run_folder import RunFolder
 from famle_agent.utils.chance import alone
+from famle_agent.utils.deadline import Deadline
+from famle_agent.utils.errors import SensorError
 
 __all__ = ["ModelBasedAgent"]
 
@@ -99,6 +104,8 @@ class ModelBasedAgent(StoredAgent):
         policy: What the agent has learnt, and how it acts on it.
         num_timesteps: Steps that the agent has lived on robots.
         num_iterations: Iterations of learning in the last meta-training.
+        overruns: How often planning took longer than ``step_budget_ms``.
+        cut_short: How often the planner left out iterations, so that it would not.
         last_check: What planning was worth in simulation when it ended; None where nobody looked.
 
     Raises:
@@ -167,6 +174,7 @@ class ModelBasedAgent(StoredAgent):
             dims = special_dims(self.env, given, config.model.egocentric, config.model.raw_angles)
             self.policy.robot = Interface(self.observation_space, self.action_space, dims)
             self._take_reward(self.env)
+            _ = self.policy.idle_action  # refuses a safe action that is none
         elif reward_fn is not None and not callable(reward_fn):
             raise ValueError(f"reward_fn must be a function, got {reward_fn!r}.")
         self._setup_model()
@@ -201,8 +209,10 @@ class ModelBasedAgent(StoredAgent):
         self._served: object = None
         self._told: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None  # what observe() was last told
         self._refused: OnlineState | None = None  # the state whose last observation was refused
+        self._senses: Senses | None = None  # of the robots of whom learn(), observe() and locate() were told last
         self._calls = 0  # of the environment's steps and resets when learn() last ended
-        self._warned_of_divergence = False
+        self._warned_of_divergence = self._warned_of_sensors = False
+        self.overruns = self.cut_short = 0
         self.generator.seed()
         self.set_random_seed(self.seed)
         if self.config.adaptation.gradient is not None:
@@ -266,6 +276,11 @@ class ModelBasedAgent(StoredAgent):
     def controller(self) -> Controller:
         """Algorithm 2 with the agent's adapter, planner and reward."""
         return self.policy.controller
+
+    @property
+    def perception(self) -> Perception:
+        """The same on robots whose sensors may fail."""
+        return self.policy.perception
 
     # --- learning in simulation -------------------------------------------------------------------------
 
@@ -394,7 +409,7 @@ class ModelBasedAgent(StoredAgent):
             "seed": self.seed,
             "situations": list(source.situations),
             "transitions": source.digest() if isinstance(source, Transitions) else None,
-            "hyperparameters": self.config.to_dict(),
+            "hyperparameters": {name: value for name, value in self.config.to_dict().items() if name not in SAFETY},
         }
 
     # --- living on a robot ------------------------------------------------------------------------------
@@ -416,6 +431,10 @@ class ModelBasedAgent(StoredAgent):
         robots has is its own: a single observation is then of a robot of which nothing is known. To callbacks each step
         is a rollout, as with an off-policy algorithm that learns at every step.
 
+        An observation that cannot be a measurement is not learnt from, and the agent plans from where its model says
+        that the robot is; see :class:`~famle_agent.adaptation.perception.Safety`. TensorBoard counts these under
+        ``health``.
+
         Args:
             total_timesteps: Steps of the robot, all robots of a ``VecEnv`` counted.
             callback: Stable-Baselines3 callbacks, or a function.
@@ -425,6 +444,7 @@ class ModelBasedAgent(StoredAgent):
             progress_bar: Whether to show a progress bar.
 
         Raises:
+            SensorError: No robot has had an observation that can be a measurement for too long.
             ValueError: The agent has no environment, or ``log_interval`` is not positive.
         """
         if log_interval is not None and log_interval < 1:
@@ -438,7 +458,7 @@ class ModelBasedAgent(StoredAgent):
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         hooks.on_training_start(locals(), globals())
-        controller, state, watch = self.controller, self.state_of(env.num_envs), VecWatch(env)
+        perception, state, watch = self.perception, self.state_of(env.num_envs), VecWatch(env)
         self._told = None
         self._calls = watch.calls
         while self.num_timesteps < total_timesteps:
@@ -446,16 +466,23 @@ class ModelBasedAgent(StoredAgent):
             if watch.calls != self._calls:  # a callback has moved the robots
                 self._last_obs, self._last_episode_starts = env.reset(), np.ones(env.num_envs, dtype=bool)  # type: ignore[assignment]
             starts = torch.as_tensor(self._last_episode_starts, dtype=torch.bool, device=self.device)
-            obs = self.policy.builder.tensor(vec_observations(self._last_obs, env))
-            action, state = controller.act(state, obs, starts, self.generator)
+            readings = self.policy.builder.tensor(vec_readings(self._last_obs, env))
             self._last_obs, resets = None, watch.resets()  # the next learn() resets, should this step fail
-            step = vec_step(env, to_action_space(action, self.action_space))
+            state = perception.begin(state, readings, starts)
+            action, state = self._act(perception, state, starts, self.generator, self._deadline())
+            try:
+                step = vec_step(env, to_action_space(action, self.action_space))
+            except BaseException:
+                self._senses = _dropping(state, torch.ones_like(starts))
+                raise
             self.num_timesteps, self._calls = self.num_timesteps + env.num_envs, watch.calls
             new_obs, rewards, dones, infos = step.obs, step.rewards, step.dones, step.infos  # by names callbacks know
             reset_alone = watch.resets() - resets != dones if len(resets) else np.zeros_like(dones)
             lost = torch.as_tensor(reset_alone | ~step.known, device=self.device)
-            reached = self.policy.builder.tensor(step.reached)
-            state = self._live = self._observed(controller.observe(state, reached, lost))
+            state, transitions = perception.sense(state, self.policy.builder.tensor(step.reached), ~lost)
+            state = replace(state, senses=_dropping(state, lost))
+            state = self._live = self._observed(perception.observe(state, transitions))
+            self._senses = state.senses
             self._last_obs, self._last_episode_starts = new_obs, dones | reset_alone
             self._update_info_buffer(infos, dones)
             hooks.update_locals(locals())
@@ -486,6 +513,7 @@ class ModelBasedAgent(StoredAgent):
             self.logger.record("adapt/situation", most_likely, exclude="tensorboard")
             log_posterior(self.logger, self.marginals())
             log_adaptations(self.logger, self._live.belief)
+            log_health(self.logger, _senses(self._live).counts, self.overruns, self.cut_short)
         since_start = self.num_timesteps - self._num_timesteps_at_start
         log_time(self.logger, self.num_timesteps, since_start, self._episode_num, self.start_time)
         self.logger.dump(self.num_timesteps)
@@ -510,7 +538,10 @@ class ModelBasedAgent(StoredAgent):
         agent believes. So a ``FAMLEWrapper`` and a loop that passes the state back (``evaluate_policy``) adapt once.
 
         Args:
-            observation: (obs_dim,) for one robot or (B, obs_dim) for B.
+            observation: (obs_dim,) for one robot or (B, obs_dim) for B; None where none came. What cannot be a
+                measurement, such as NaN, is not learnt from: with a state, the agent plans from where its model says
+                that the robot is, see :class:`~famle_agent.adaptation.perception.Safety`. So it does without one where
+                :meth:`observe` was told of that observation.
             state: What the last call returned, or None.
             episode_start: Whether each robot has just been reset, (B,). The transition across it is dropped. After a
                 step of Gymnasium's vector environments these are the robots whose episode has ended in that step; with
@@ -524,70 +555,123 @@ class ModelBasedAgent(StoredAgent):
 
         Raises:
             NotLearnedError: The agent has no model yet.
-            ValueError: The observation has the wrong shape or is not finite.
+            SensorError: No robot has had an observation that can be a measurement for too long.
+            ValueError: The observation has the wrong shape, or is of no numbers.
         """
-        controller = self.controller
+        perception, deadline = self.perception, self._deadline()
         try:
-            numbers = check_observation(observation, self.observation_space)
+            numbers = reading(observation, self.observation_space)
         except ValueError:
             self._refused = state  # whose next observation is not one step behind its last one
             raise
-        if state is not None and state is self._refused:
-            state = replace(state, last=None)
-        obs = self.policy.builder.tensor(np.atleast_2d(numbers))
-        starts = torch.zeros(len(obs), dtype=torch.bool, device=self.device)
+        was_refused = state is not None and state is self._refused
+        readings = self.policy.builder.tensor(np.atleast_2d(numbers))
+        starts = torch.zeros(len(readings), dtype=torch.bool, device=self.device)
         if episode_start is not None:
             starts = torch.tensor(np.atleast_1d(episode_start), dtype=torch.bool, device=self.device)
-        if len(starts) != len(obs) or (state is not None and state.robots != len(obs)):
+        if len(starts) != len(readings) or (state is not None and state.robots != len(readings)):
             raise ValueError(
-                f"Got {len(obs)} observations, but {len(starts)} values of episode_start and a state of "
-                f"{len(obs) if state is None else state.robots} robots; they must be of the same robots."
+                f"Got {len(readings)} observations, but {len(starts)} values of episode_start and a state of "
+                f"{len(readings) if state is None else state.robots} robots; they must be of the same robots."
             )
         generator = self.generator
         if deterministic:
             generator = torch.Generator(self.device).manual_seed(self.seed or 0)
-        if state is None:
-            action, state = controller.act(self.state_of(len(obs)), obs, starts, generator)
-            if self._live is not None and self._live.robots == len(obs):
-                self._live = replace(self._live, plan=state.plan)  # a loop that drops the state keeps its plan
-        else:
-            action, state = controller.act(self._caught_up(state, obs, starts), obs, starts, generator)
+        given = state
+        if state is not None and was_refused:
+            state = replace(state, last=None)
+        state = self.state_of(len(readings)) if state is None else self._caught_up(perception, state, readings, starts)
+        state = perception.begin(state, readings, starts | was_refused)
+        try:
+            action, state = self._act(perception, state, starts, generator, deadline)
+        except SensorError:
+            self._refused = given
+            raise
+        if given is None and self._live is not None and self._live.robots == len(readings):
+            self._live = replace(self._live, plan=state.plan)  # a loop that drops the state keeps its plan
         self._observed(state)
         actions = to_action_space(action, self.action_space)
         return (actions[0] if numbers.ndim == 1 else actions), state
 
-    def _caught_up(self, state: OnlineState, obs: torch.Tensor, starts: torch.Tensor) -> OnlineState:
+    def _act(
+        self,
+        perception: Perception,
+        state: OnlineState,
+        starts: torch.Tensor,
+        generator: torch.Generator,
+        deadline: Deadline | None,
+    ) -> tuple[torch.Tensor, OnlineState]:
+        """Plans by a deadline, and counts what was late."""
+        planned = perception.act(state, starts, generator, deadline)
+        if deadline is not None:
+            self.overruns += deadline.passed
+            self.cut_short += deadline.cut_short
+        return planned
+
+    def _deadline(self) -> Deadline | None:
+        budget = self.config.safety.step_budget_ms
+        return None if budget is None else Deadline(budget, self.device)
+
+    def _caught_up(
+        self, perception: Perception, state: OnlineState, readings: torch.Tensor, starts: torch.Tensor
+    ) -> OnlineState:
         """Adds the step that ends here to a state, unless :meth:`observe` was told of it."""
-        if self._live is None or self._told is None or state.last is None or len(self._told[0]) != len(obs):
-            return self.controller.observe(state, obs, starts)
+        if state.last is None:
+            return state
+        sensed, transitions = perception.sense(state, readings, ~starts)
+        if self._live is None or self._told is None or len(self._told[0]) != len(readings):
+            return perception.observe(sensed, transitions)
         (s, a, s_next), (last_s, last_a) = self._told, state.last
         same_step = torch.equal(s, last_s) and torch.allclose(a, last_a, atol=1e-5)
-        if not (same_step and torch.equal(s_next[~starts], obs[~starts])):
-            return self.controller.observe(state, obs, starts)
-        return replace(self._live, plan=state.plan, last=None)
+        if not (same_step and torch.equal(s_next[~starts], _senses(sensed).obs[~starts])):
+            return perception.observe(sensed, transitions)
+        return replace(self._live, plan=state.plan, last=None, senses=self._senses)
 
     @torch.inference_mode(mode=False)
-    def observe(self, obs: Array, action: Array, next_obs: Array) -> None:
+    def observe(self, obs: Array | None, action: Array, next_obs: Array | None) -> None:
         """Tells the agent of a transition of its robot; every K transitions it adapts.
 
+        A transition with an observation that cannot be a measurement, such as NaN, is counted and not learnt from.
+
         Args:
-            obs: (obs_dim,) or (B, obs_dim).
+            obs: (obs_dim,) or (B, obs_dim); None where none came.
             action: (action_dim,) or (B, action_dim); clipped to the action space, as a robot clips it.
             next_obs: As ``obs``.
 
         Raises:
             NotLearnedError: The agent has no model yet.
-            ValueError: A shape is wrong, or a value is not finite.
+            ValueError: A shape is wrong, or the action is not finite.
         """
-        controller, space = self.controller, self.observation_space
-        s, s_next = (self.policy.builder.tensor(np.atleast_2d(check_observation(o, space))) for o in (obs, next_obs))
+        perception, space = self.perception, self.observation_space
+        s, s_next = (self.policy.builder.tensor(np.atleast_2d(reading(o, space))) for o in (obs, next_obs))
         a = self.policy.builder.tensor(np.atleast_2d(check_action(action, self.action_space)))
         if not len(s) == len(a) == len(s_next):
             raise ValueError(f"Got {len(s)} observations, {len(a)} actions and {len(s_next)} next observations.")
         a = self.policy.builder.action_scale.to_unit(a).clamp(-1.0, 1.0)
-        state, self._told = replace(self.state_of(len(s)), last=(s, a)), (s, a, s_next)
-        moved = torch.zeros(len(s), dtype=torch.bool, device=self.device)
-        self._live = self._observed(controller.observe(state, s_next, moved))
+        everyone = torch.ones(len(s), dtype=torch.bool, device=self.device)
+        state = perception.begin(self.state_of(len(s)), s, ~everyone)
+        s = _senses(state).obs
+        state, transitions = perception.sense(replace(state, last=(s, a)), s_next, everyone)
+        self._told = s, a, _senses(state).obs
+        self._live = self._observed(perception.observe(state, transitions))
+        self._senses = self._live.senses
+
+    @torch.inference_mode(mode=False)
+    def locate(self, obs: Array | None, dropped: bool = False) -> None:
+        """Tells the agent where its robot is, where nobody knows how it got there.
+
+        Args:
+            obs: (obs_dim,) or (B, obs_dim); None where none came.
+            dropped: Whether to count a step of the robot that was no transition, such as one that failed.
+
+        Raises:
+            NotLearnedError: The agent has no model yet.
+            ValueError: The shape is wrong.
+        """
+        readings = self.policy.builder.tensor(np.atleast_2d(reading(obs, self.observation_space)))
+        everyone = torch.ones(len(readings), dtype=torch.bool, device=self.device)
+        state = self.perception.begin(self.state_of(len(readings)), readings, everyone)
+        self._senses = _dropping(state, everyone & dropped)
 
     @torch.inference_mode(mode=False)
     def begin_episode(self) -> None:
@@ -597,8 +681,8 @@ class ModelBasedAgent(StoredAgent):
             self._live = self._observed(self.controller.reset(self._live, starts))
 
     def forget(self) -> None:
-        """Returns to what was meta-learned, as for a robot that was just repaired."""
-        self._live = None
+        """Returns to what was meta-learned, as for a robot that was just repaired; counts of sensors begin at 0."""
+        self._live = self._senses = None
 
     def serve(self, wrapper: object, takes_over: bool = True) -> None:
         """Notes whose robot the agent is on.
@@ -667,6 +751,31 @@ class ModelBasedAgent(StoredAgent):
         error, steps = state.belief.errors[robot] / self.model.usual_error, int(state.memory.weight[robot].sum())
         return Diagnosis.of(self.posterior(state, robot), float(error), steps)
 
+    def health(self, state: OnlineState | None = None, robot: int = 0) -> dict[str, int]:
+        """Counts what was missing or late on a robot, as ``info["famle"]`` and TensorBoard do.
+
+        Args:
+            state: As :meth:`predict` returns it; None asks for what the agent has been told last.
+            robot: Which of the robots that run side by side.
+
+        Returns:
+            ``quarantined``, transitions that were not learnt from, since an observation could not be a measurement;
+            ``blind``, observations since the last one that could; ``dropped``, steps that were no transition for
+            another reason; ``repeated``, observations that were those of the step before to the last bit. Of all robots
+            together, ``overruns``, how often planning took longer than ``step_budget_ms``, and ``cut_short``, how often
+            it left out iterations.
+
+        Raises:
+            IndexError: There is no such robot.
+        """
+        senses = self._senses if state is None else state.senses
+        if senses is None:
+            senses = _senses(self._state_for(state, robot))
+        if not 0 <= robot < senses.robots:
+            raise IndexError(f"There are robots 0 to {senses.robots - 1}, not {robot}.")
+        counts = {name: int(count[robot]) for name, count in senses.counts.items()}
+        return {**counts, "overruns": self.overruns, "cut_short": self.cut_short}
+
     def _state_for(self, state: OnlineState | None, robot: int) -> OnlineState:
         state = state or self._live or self.state_of(self.model.robots)
         if not 0 <= robot < state.robots:
@@ -674,7 +783,17 @@ class ModelBasedAgent(StoredAgent):
         return state
 
     def _observed(self, state: OnlineState) -> OnlineState:
-        """Passes a state on, and warns of the first adaptation that diverged."""
+        """Passes a state on, and warns of the first adaptation that diverged and of the first sensor that failed."""
+        senses = state.senses
+        if not self._warned_of_sensors and senses is not None and not senses.measured.all():
+            self._warned_of_sensors = True
+            robots = (~senses.measured).nonzero()[:, 0].tolist()
+            warnings.warn(
+                f"An observation of robot {', '.join(map(str, robots))} cannot be a measurement: "
+                f"{senses.reading[robots[0]].tolist()}. It is not learnt from, and plans begin where the model "
+                'says that the robot is. info["famle"] and TensorBoard count these from here on.',
+                stacklevel=4,
+            )
         if not self._warned_of_divergence and state.belief.diverged.any():
             self._warned_of_divergence = True
             warnings.warn(
@@ -696,9 +815,10 @@ class ModelBasedAgent(StoredAgent):
         Raises:
             NotLearnedError: The agent has no model yet.
         """
+        senses = self._senses if self._senses is not None and self._senses.robots == robots else None
         if self._live is not None and self._live.robots == robots:
-            return replace(self._live, last=None)
-        return self.policy.initial(robots)
+            return replace(self._live, last=None, senses=senses)
+        return replace(self.policy.initial(robots), senses=senses)
 
 
 def _check_policy(env: object, policy: object) -> None:
@@ -711,6 +831,18 @@ def _check_policy(env: object, policy: object) -> None:
         raise ValueError(f"The environment comes first, and a policy may follow by name: (env, policy={env!r}).")
     if policy not in (None, "MlpPolicy"):
         raise ValueError(f"policy must be 'MlpPolicy' or None, got {policy!r}: the agent plans, and learns no other.")
+
+
+def _senses(state: OnlineState) -> Senses:
+    """What the sensors of a state's robots have said; nothing where nobody has asked."""
+    if state.senses is not None:
+        return state.senses
+    return Senses.none(state.robots, state.memory.obs.shape[2], state.plan.device)
+
+
+def _dropping(state: OnlineState, dropped: torch.Tensor) -> Senses:
+    """The same, with a step of some robots (B,) that was no transition."""
+    return _senses(state).dropping(dropped)
 
 
 def _description(env: VecEnv) -> dict[str, Any] | None:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Set
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from famle_agent.adaptation.perception import Safety
 from famle_agent.adaptation.settings import Adaptation
 from famle_agent.agents.keywords import AT_LEAST_ONE, CHOICES, HINTS, ONLINE, SEEN_IN_DIMS, keywords_of, parts_of
 from famle_agent.agents.simulation import Rounds, Simulation
@@ -16,7 +17,7 @@ from famle_agent.planning import ICEM, Planner
 from famle_agent.training.reptile import Reptile
 from famle_agent.training.trainer import MetaTrainer
 
-__all__ = ["Config", "Hyperparameters", "Rounds", "Simulation"]
+__all__ = ["Config", "Hyperparameters", "Rounds", "Safety", "Simulation"]
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Config:
         planner: How it is planned with.
         planning_reward: Name of the environment's function that the planner maximises; empty takes its
             ``planning_reward_fn`` or ``reward_fn``.
+        safety: What happens on the robot where an observation is missing or a step is late.
 
     Raises:
         ValueError: A value is out of range, or two contradict each other.
@@ -42,6 +44,7 @@ class Config:
     adaptation: Adaptation = field(default_factory=Adaptation)
     planner: Planner = field(default_factory=ICEM)
     planning_reward: str = ""
+    safety: Safety = field(default_factory=Safety)
 
     def __post_init__(self) -> None:
         for name, value in self.to_dict().items():

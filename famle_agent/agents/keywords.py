@@ -14,6 +14,7 @@ from collections.abc import Iterable, Mapping, Set
 from numbers import Integral, Real
 from typing import Any
 
+from famle_agent.adaptation.perception import Safety
 from famle_agent.adaptation.settings import Adaptation, Epochs, Filter, GradientSteps, Steps, Window
 from famle_agent.agents.simulation import Rounds, Simulation
 from famle_agent.agents.world_model import ModelConfig
@@ -25,7 +26,7 @@ from famle_agent.training.policy_search import PolicySearch
 from famle_agent.training.reptile import Reptile
 from famle_agent.training.trainer import MetaTrainer
 
-__all__ = ["AT_LEAST_ONE", "CHOICES", "HINTS", "ONLINE", "SEEN_IN_DIMS", "keywords_of", "parts_of"]
+__all__ = ["AT_LEAST_ONE", "CHOICES", "HINTS", "ONLINE", "SAFETY", "SEEN_IN_DIMS", "keywords_of", "parts_of"]
 
 
 def parts_of(values: Mapping[str, Any], chosen: Set[str]) -> dict[str, Any]:
@@ -47,6 +48,7 @@ def parts_of(values: Mapping[str, Any], chosen: Set[str]) -> dict[str, Any]:
         "training": _training(read),
         "adaptation": _adaptation(read),
         "planner": _planner(read),
+        "safety": read.part(Safety),
         "planning_reward": read["planning_reward"],
     }
     # What is 0, False or None asks for nothing, and needs no effect.
@@ -209,6 +211,7 @@ _NAMES: dict[type, dict[str, str]] = {
     RandomShooting: _LOOK_AHEAD,
     ICEM: {**_LOOK_AHEAD, **_NOISE, **_same("elites")},
     MPPI: {**_LOOK_AHEAD, **_NOISE, **_same("temperature")},
+    Safety: _same("blind_steps", "safe_action", "step_budget_ms"),
 }
 """The keyword of each field of each part."""
 
@@ -236,13 +239,16 @@ for _name in ("adapt_steps", "adapt_lr", "adapt_embedding_lr", "adapt_optimizer"
 ONLINE = {
     *(
         keyword
-        for part in (Adaptation, Window, Filter, GradientSteps, Steps, Epochs)
+        for part in (Adaptation, Window, Filter, GradientSteps, Steps, Epochs, Safety)
         for keyword in _NAMES[part].values()
     ),
     *(keyword for part in _PLANNERS.values() for keyword in _NAMES[part].values()),
     *("planner", "planning_reward"),
 }
 """Settings of the life on a robot; rounds in simulation plan too, but a model may be used with another planner."""
+
+SAFETY = frozenset(_NAMES[Safety].values())
+"""Settings that matter to a robot alone, and to nothing that is learnt."""
 
 SEEN_IN_DIMS = {"egocentric", "raw_angles"}
 """Settings by which models differ where their dimensions do, which are compared by themselves."""
@@ -304,9 +310,10 @@ def _check_type(name: str, value: Any) -> None:
     kinds = typing.get_args(HINTS[name]) or (HINTS[name],)
     if value is None and type(None) in kinds:
         return
-    if name in ("hidden", "policy_hidden"):
+    if typing.get_origin(HINTS[name]) is tuple:
         if isinstance(value, str) or not isinstance(value, Iterable):
-            raise TypeError(f"{name} must be a list of whole numbers, got {value!r}.")
+            numbers = "whole numbers" if int in kinds else "numbers"
+            raise TypeError(f"{name} must be a list of {numbers}, got {value!r}.")
         return
     for kind, accepted, what in _KINDS:
         if kind in kinds and (not isinstance(value, accepted) or isinstance(value, bool) != (kind is bool)):

@@ -6,6 +6,7 @@ import warnings
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,6 +14,8 @@ from famle_agent.adaptation.adapters import EmbeddingAdapter, GradientAdapter
 from famle_agent.adaptation.controller import Adapter, Controller, OnlineState
 from famle_agent.adaptation.guide import Guide
 from famle_agent.adaptation.memory import Memory
+from famle_agent.adaptation.perception import Perception
+from famle_agent.adaptation.senses import Sensors
 from famle_agent.agents.config import Config
 from famle_agent.agents.world_model import Interface, ModelBuilder, WorldModel
 from famle_agent.models.dynamics import Dynamics
@@ -120,6 +123,31 @@ class AdaptivePolicy:
             guide = Guide(world.actor_critic)
         when = how.every, how.at_reset, how.forget_at_reset
         return Controller(adapter, self.config.planner, objective, *when, guide)
+
+    @property
+    def perception(self) -> Perception:
+        """The same on robots whose sensors may fail.
+
+        Raises:
+            NotLearnedError: There is no model yet.
+            ValueError: There is no reward, or the safe action is none of the robot's.
+        """
+        safety, sensors = self.config.safety, Sensors.of(self.model, self.builder.robot.observation_space)
+        blind_steps = self.config.planner.horizon if safety.blind_steps is None else safety.blind_steps
+        return Perception(self.controller, sensors, blind_steps, self.idle_action, patient=bool(safety.safe_action))
+
+    @property
+    def idle_action(self) -> Tensor:
+        """What is told to a robot without sensors, in [-1, 1], (action_dim,): the safe action, or what is nearest to 0.
+
+        Raises:
+            ValueError: The safe action does not lie in the action space.
+        """
+        space, safe = self.builder.robot.action_space, self.config.safety.safe_action
+        action = np.array(safe) if safe else np.clip(np.zeros(space.shape), space.low, space.high)
+        if action.shape != space.shape or not ((action >= space.low) & (action <= space.high)).all():
+            raise ValueError(f"safe_action must be an action of {space}, got {list(safe)}.")
+        return self.builder.action_scale.to_unit(self.builder.tensor(action)).clamp(-1.0, 1.0)
 
     def initial(self, robots: int) -> OnlineState:
         """Returns the state of B robots that have seen nothing.

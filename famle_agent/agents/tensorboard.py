@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from famle_agent.adaptation.belief import Belief
 
-__all__ = ["encode_gif", "log_adaptations", "log_embeddings", "log_gif", "log_posterior"]
+__all__ = ["encode_gif", "log_adaptations", "log_embeddings", "log_gif", "log_health", "log_posterior"]
 
 Frames = Sequence[npt.NDArray[np.uint8]]
 
@@ -44,6 +44,21 @@ def log_adaptations(logger: Logger, belief: Belief) -> None:
     """Records how often robots have adapted, and how often that diverged, all robots together."""
     logger.record("adapt/adaptations", belief.adaptations)
     logger.record("adapt/diverged", int(belief.diverged.sum()))
+
+
+def log_health(logger: Logger, sensors: Mapping[str, Tensor], overruns: int, cut_short: int) -> None:
+    """Records what was missing or late, all robots together.
+
+    Args:
+        logger: The agent's logger.
+        sensors: What was counted of the sensors of each robot, (B,), by name.
+        overruns: How often planning took too long.
+        cut_short: How often the planner left out iterations.
+    """
+    for name, counts in sensors.items():
+        logger.record(f"health/{name}", int(counts.sum()))
+    logger.record("health/overruns", overruns)
+    logger.record("health/cut_short", cut_short)
 
 
 def log_gif(logger: Logger, tag: str, frames: Frames, fps: float, step: int) -> None:

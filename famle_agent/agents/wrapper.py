@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import fields
 from typing import Any
 
@@ -15,7 +14,7 @@ from gymnasium.utils import RecordConstructorArgs
 from famle_agent.agents.agent import ModelBasedAgent
 from famle_agent.agents.presets import make_env
 from famle_agent.data import gate
-from famle_agent.data.gate import check_action, check_observation
+from famle_agent.data.gate import check_action
 from famle_agent.data.watch import Watch
 
 __all__ = ["FAMLEWrapper"]
@@ -43,8 +42,12 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
 
     Each step's ``info["famle"]`` says what the agent believes: ``situation``, the most likely training situation;
     ``probability``, how likely it is among them; ``posterior``, all of them by name; ``adaptations``, how often the
-    agent has adapted; ``diverged``, how often its gradient steps left the finite numbers and were taken back. The
-    memory outlasts a reset, as damage does; ``agent.forget()`` empties it.
+    agent has adapted; ``diverged``, how often its gradient steps left the finite numbers and were taken back; and what
+    was missing or late, see :meth:`~famle_agent.agents.agent.ModelBasedAgent.health`. The memory outlasts a reset, as
+    damage does; ``agent.forget()`` empties it.
+
+    An observation that cannot be a measurement, such as NaN, is passed on as it is. Give it to ``agent.predict``, which
+    plans from where its model says that the robot is; see :class:`~famle_agent.adaptation.perception.Safety`.
 
     Args:
         env: The robot's environment.
@@ -66,7 +69,7 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
             )
         agent.check_task(env)
         self.agent, self._watch = agent, Watch(env)
-        self._obs: Array | None = None  # None too where nobody knows where the robot is
+        self._obs: Array | None = None  # None where nobody knows where the robot is; NaN where no sensor tells
         self._begun = False
         self._calls = self._resets = 0
 
@@ -88,9 +91,8 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
         self.agent.serve(self)
         self.agent.begin_episode()
         self._begun = True
-        self._know(None)
-        with suppress(ValueError):  # predict() refuses such a start
-            self._know(check_observation(obs, self.agent.observation_space))
+        self.agent.locate(obs)
+        self._know(obs)
         return obs, info | {"famle": self._belief()}
 
     def step(self, action: Array) -> tuple[Array, Any, bool, bool, dict[str, Any]]:
@@ -100,8 +102,8 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
 
         Raises:
             RuntimeError: Another wrapper was reset with the same agent.
-            ValueError: The action, or something that the environment returned, has a wrong type or shape or is not
-                finite.
+            ValueError: The action has a wrong shape or is not finite, or something that the environment returned has a
+                wrong type or shape.
         """
         if not self._begun:
             raise gym.error.ResetNeeded("Call reset() before step().")
@@ -112,19 +114,26 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
             self.agent.begin_episode()
         resets, before = self._watch.resets, self._obs if self._watch.calls == self._calls else None
         self._obs = None
-        step = gate.step(self.env, commanded)
+        try:
+            step = gate.robot_step(self.env, commanded)
+        except BaseException:
+            self.agent.locate(None, dropped=True)
+            raise
         was_reset = self._watch.resets != resets
         reached = step.final_obs if was_reset else step.obs
-        if before is not None and reached is not None:
+        dropped = before is None or (was_reset and reached is None)
+        if not dropped:
             self.agent.observe(before, commanded, reached)
         if was_reset:
             self.agent.begin_episode()
+        if was_reset or dropped:
+            self.agent.locate(step.obs, dropped)
         self._know(step.obs)
         return step.obs, step.reward, step.terminated, step.truncated, step.info | {"famle": self._belief()}
 
     def _know(self, obs: Array | None) -> None:
         """Notes where the robot is, and that nobody has moved it since."""
-        self._obs = None if obs is None else obs.copy()
+        self._obs = gate.reading(obs, self.agent.observation_space)
         self._calls, self._resets = self._watch.calls, self._watch.resets
 
     def _belief(self) -> dict[str, Any]:
@@ -136,4 +145,5 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
             "posterior": posterior,
             "adaptations": belief.adaptations,
             "diverged": int(belief.diverged.sum()),
+            **self.agent.health(),
         }

@@ -23,9 +23,11 @@ __all__ = [
     "check_observation",
     "floats",
     "numbers",
+    "reading",
     "reset",
+    "robot_step",
     "step",
-    "vec_observations",
+    "vec_readings",
     "vec_step",
 ]
 
@@ -37,14 +39,14 @@ class Step:
     """What one step of an environment returned.
 
     Attributes:
-        obs: A copy in the environment's own dtype, (obs_dim,).
-        reward: A finite number.
+        obs: A copy in the environment's own dtype, (obs_dim,); None where no observation came.
+        reward: A number.
         terminated: Whether the episode ended by itself.
         truncated: Whether it was cut short.
         info: A shallow copy.
     """
 
-    obs: Array
+    obs: Any
     reward: float
     terminated: bool
     truncated: bool
@@ -58,7 +60,7 @@ class Step:
 
 @dataclass(frozen=True)
 class VecStep:
-    """What one step of n robots returned.
+    """What one step of n robots returned; observations and rewards need not be finite.
 
     Attributes:
         obs: Where the robots are now, (n, obs_dim), float32; of one whose episode has ended, the next one's start.
@@ -100,12 +102,16 @@ def numbers(name: str, values: Any) -> Array:
         ValueError: They are no numbers, or not finite in single precision.
     """
     array = floats(name, values)
+    _check_finite(name, array)
+    return array
+
+
+def _check_finite(name: str, array: Array) -> None:
     if not np.isfinite(array).all():
         raise ValueError(
             f"The {name} holds NaN or infinite values, or such that are not finite in single precision: {array}. Check "
             "the robot's sensors and commands."
         )
-    return array
 
 
 def check_observation(observation: Any, space: spaces.Box) -> Array:
@@ -114,9 +120,25 @@ def check_observation(observation: Any, space: spaces.Box) -> Array:
     Raises:
         ValueError: It has another shape, is not finite, or is the pair that Gymnasium's ``reset`` returns.
     """
+    array = reading(observation, space)
+    _check_finite("observation", array)
+    return array
+
+
+def reading(observation: Any, space: spaces.Box) -> Array:
+    """The same of a robot whose sensors may fail: any floats, and None for an observation that did not come.
+
+    Returns:
+        (obs_dim,) or (B, obs_dim), float32; NaN in the place of what did not come.
+
+    Raises:
+        ValueError: It has another shape, is of no numbers, or is the pair that Gymnasium's ``reset`` returns.
+    """
+    if observation is None:
+        return np.full(space.shape, np.nan, dtype=np.float32)
     if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], Mapping):
         raise ValueError("Got (obs, info), as Gymnasium's reset() returns it; give obs alone.")
-    return _of_space("observation", observation, space)
+    return _of_space("observation", floats("observation", observation), space)
 
 
 def check_action(action: Any, space: spaces.Box) -> Array:
@@ -125,11 +147,10 @@ def check_action(action: Any, space: spaces.Box) -> Array:
     Raises:
         ValueError: It has another shape or is not finite.
     """
-    return _of_space("action", action, space)
+    return _of_space("action", numbers("action", action), space)
 
 
-def _of_space(name: str, values: Any, space: spaces.Box) -> Array:
-    array = numbers(name, values)
+def _of_space(name: str, array: Array, space: spaces.Box) -> Array:
     if array.ndim not in (1, 2) or array.shape[-1:] != space.shape:
         raise ValueError(
             f"The {name} must have shape {space.shape}, or (B, {space.shape[0]}) for B robots, got {array.shape}."
@@ -148,7 +169,7 @@ def _numeric(values: Any) -> Array:
 
 
 def _one(name: str, value: Any) -> float:
-    array = numbers(name, value)
+    array = floats(name, value)
     if array.size != 1:
         raise ValueError(f"The {name} must be one number, got an array of shape {array.shape}.")
     return float(np.asarray(value, dtype=np.float64).reshape(()))
@@ -158,7 +179,7 @@ def _flag(name: str, value: Any) -> bool:
     if isinstance(value, bool):
         return value
     number = _one(name, value)
-    if number not in (0.0, 1.0):
+    if number not in (0.0, 1.0):  # nor NaN
         raise ValueError(f"{name} must be True or False, got {value!r}.")
     return bool(number)
 
@@ -188,11 +209,12 @@ def reset(env: gym.Env[Any, Any], **arguments: Any) -> tuple[Array, dict[str, An
     returned = env.reset(**arguments)
     if not isinstance(returned, tuple) or len(returned) != 2:
         raise ValueError(f"reset() of {env} must return (obs, info), got {_what(returned)}.")
+    numbers("observation", returned[0])
     return _observed(returned[0], env), _info(returned[1])
 
 
 def step(env: gym.Env[Any, Any], action: Any) -> Step:
-    """Steps an environment with a copy of an action.
+    """Steps a simulated environment with a copy of an action.
 
     Args:
         env: The environment.
@@ -200,6 +222,22 @@ def step(env: gym.Env[Any, Any], action: Any) -> Step:
 
     Raises:
         ValueError: Something that it returned has a wrong type or shape, or is not finite.
+    """
+    stepped = robot_step(env, action)
+    numbers("observation", stepped.obs)
+    numbers("reward", stepped.reward)
+    return stepped
+
+
+def robot_step(env: gym.Env[Any, Any], action: Any) -> Step:
+    """Steps a robot, whose sensors may fail: what it observes and its reward may be no finite numbers.
+
+    Args:
+        env: The robot's environment.
+        action: What to send, (action_dim,).
+
+    Raises:
+        ValueError: Something that it returned has a wrong type or shape.
     """
     returned = env.step(np.array(action))
     if not isinstance(returned, tuple) or len(returned) != 5:
@@ -209,7 +247,7 @@ def step(env: gym.Env[Any, Any], action: Any) -> Step:
         )
     obs, reward, terminated, truncated, info = returned
     return Step(
-        _observed(obs, env),
+        None if obs is None else _observed(obs, env),
         _one("reward", reward),
         _flag("terminated", terminated),
         _flag("truncated", truncated),
@@ -231,7 +269,7 @@ def check_not_reset(env: gym.Env[Any, Any], resets: int) -> None:
 
 
 def _observed(obs: Any, env: gym.Env[Any, Any]) -> Array:
-    array, shape = numbers("observation", obs), env.observation_space.shape
+    array, shape = floats("observation", obs), env.observation_space.shape
     if array.shape != shape:
         raise ValueError(f"The observation of {env} must have the shape of its space, {shape}, got {array.shape}.")
     return np.array(obs)
@@ -244,36 +282,36 @@ def _what(returned: Any) -> str:
 # --- vector environments ------------------------------------------------------------------------------------
 
 
-def vec_observations(obs: Any, env: VecEnv) -> Array:
-    """The observations of n robots as a float32 array of their own, (n, obs_dim).
+def vec_readings(obs: Any, env: VecEnv) -> Array:
+    """The observations of n robots as a float32 array of their own, (n, obs_dim), finite or not.
 
     Raises:
-        ValueError: They have another shape, or are not finite.
+        ValueError: They have another shape.
     """
-    array, shape = numbers("observation", obs), (env.num_envs, *(env.observation_space.shape or ()))
+    array, shape = floats("observation", obs), (env.num_envs, *(env.observation_space.shape or ()))
     if array.shape != shape:
         raise ValueError(f"The observations of a VecEnv must have shape {shape}, got {array.shape}.")
     return array
 
 
 def vec_step(env: VecEnv, actions: Array) -> VecStep:
-    """Steps n robots with copies of their actions, (n, action_dim).
+    """Steps n robots, whose sensors may fail, with copies of their actions, (n, action_dim).
 
     Raises:
-        ValueError: Something that they returned has a wrong type or shape, or is not finite.
+        ValueError: Something that they returned has a wrong type or shape.
     """
     n = env.num_envs
     obs, rewards, dones, infos = env.step(np.array(actions))
-    for name, values in (("rewards", rewards), ("dones", dones)):
-        if (array := numbers(name, values)).shape != (n,):
+    for name, values, check in (("rewards", rewards, floats), ("dones", dones, numbers)):
+        if (array := check(name, values)).shape != (n,):
             raise ValueError(f"The {name} of a VecEnv of {n} robots must have shape ({n},), got {array.shape}.")
     if len(infos) != n:
         raise ValueError(f"A VecEnv of {n} robots must return {n} infos, got {len(infos)}.")
-    now, ended = vec_observations(obs, env), np.array(dones, dtype=bool)
+    now, ended = vec_readings(obs, env), np.array(dones, dtype=bool)
     copies = [_info(info) for info in infos]
     reached, known = now.copy(), np.ones(n, dtype=bool)
     for i in np.flatnonzero(ended):
         known[i] = "terminal_observation" in copies[i]
         if known[i]:
-            reached[i] = check_observation(copies[i]["terminal_observation"], env.observation_space)  # type: ignore[arg-type]
+            reached[i] = reading(copies[i]["terminal_observation"], env.observation_space)  # type: ignore[arg-type]
     return VecStep(now, reached, np.array(rewards), known, ended, copies)

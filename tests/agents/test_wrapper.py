@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from famle_agent import FAMLE, FAMLEWrapper, NotLearnedError
+from famle_agent import FAMLE, FAMLEWrapper, NotLearnedError, SensorError
 
 Load = Callable[..., FAMLE]
 MakeEnv = Callable[..., gym.Env[Any, Any]]
+HEALTH = {"quarantined", "blind", "dropped", "repeated", "overruns", "cut_short"}
 
 
 def run(env: FAMLEWrapper, steps: int, seed: int | None = 0) -> list[dict[str, Any]]:
@@ -30,7 +31,7 @@ def test_info_says_what_the_agent_believes(quick_agent: FAMLE, make_env: MakeEnv
     assert [info["famle"]["adaptations"] for info in infos[::5]] == list(range(9))
     for info in infos:
         belief = info["famle"]
-        assert set(belief) == {"situation", "probability", "posterior", "adaptations", "diverged"}
+        assert set(belief) == {"situation", "probability", "posterior", "adaptations", "diverged"} | HEALTH
         assert tuple(belief["posterior"]) == quick_agent.situations
         assert sum(belief["posterior"].values()) == pytest.approx(1.0, abs=1e-5)
         assert belief["probability"] == max(belief["posterior"].values()) == belief["posterior"][belief["situation"]]
@@ -123,8 +124,10 @@ def test_sensor_that_fails_is_named(quick_agent: FAMLE, make_env: MakeEnv) -> No
     broken = gym.wrappers.TransformObservation(make_env(), lambda obs: obs * np.nan, None)
     env = FAMLEWrapper(broken, quick_agent)
     env.reset(seed=0)
-    with pytest.raises(ValueError, match="observation holds NaN"):
-        env.step(np.zeros(5))
+    obs, _, _, _, info = env.step(np.zeros(5))
+    assert info["famle"]["quarantined"] == 1
+    with pytest.raises(SensorError, match="observation holds NaN"):
+        quick_agent.predict(obs)
 
 
 def test_environment_may_reuse_its_observation(quick_agent: FAMLE, make_env: MakeEnv) -> None:
