@@ -179,13 +179,12 @@ class Controller:
         state = self.reset(state, starts)
         model = self.adapter.model_for(state.belief, state.memory)
         objective, proposals = self.objective, None
-        in_time = () if deadline is None else (deadline,)  # a planner of a user may know of none
         if self.guide is not None:
             likely = self.adapter.likely(state.belief)
             proposals = self.guide.proposals(model, obs, likely, self.planner.horizon, generator)
             objective = self.guide.looking_beyond(objective, likely, model.members)
         action, plan = self.planner.plan(
-            lambda tau: model.returns(objective, obs, tau), state.plan, generator, proposals, *in_time
+            lambda tau: model.returns(objective, obs, tau), state.plan, generator, proposals, deadline
         )
         return action, replace(state, plan=shift(plan), last=(obs, action))
 
