@@ -56,7 +56,8 @@ class Guide:
 
         state, actions = obs[:, None].expand(-1, rows, -1), []
         for t in range(horizon):
-            actions.append((self.actor_critic.act(state, told) + noise[:, :, t]).clamp(-1.0, 1.0))
+            # Where the model has left the finite numbers, the actor says nothing.
+            actions.append((self.actor_critic.act(state, told) + noise[:, :, t]).nan_to_num(0.0).clamp(-1.0, 1.0))
             if t + 1 < horizon:
                 state = model(state, actions[-1]).mean(dim=1)  # of the ensemble
         return torch.stack(actions, dim=2)
