@@ -30,9 +30,15 @@ _START_NOISE = 0.1  # of the joint angles (rad)
 _QUATERNION_X, _QUATERNION_Y, _X_VELOCITY = 1, 2, 13
 _OBS_DIM = 27
 
+
+def _all_but(joint: int) -> tuple[float, ...]:
+    """Gains of an ant with one dead joint."""
+    return tuple(float(i != joint) for i in range(N_JOINTS))
+
+
 _TRAINING = (
     Situation(name="intact"),
-    *(Situation(motor_gain=(1.0,) * joint + (0.0,), name=f"joint {joint} dead") for joint in range(N_JOINTS)),
+    *(Situation(motor_gain=_all_but(joint), name=f"joint {joint} dead") for joint in range(N_JOINTS)),
     *(
         Situation(orientation_error=math.radians(degrees), name=f"yaw sensor off by {degrees} deg")
         for degrees in range(30, 360, 30)
@@ -105,7 +111,7 @@ class AntEnv(RobotEnv):
     task_arguments = RobotEnv.task_arguments | {"terminate_when_fallen"}
     training_situations = _TRAINING
     presets: ClassVar[Mapping[str, Situation]] = {situation.name: situation for situation in _TRAINING} | {
-        "paper": Situation(motor_gain=(1, 1, 0), orientation_error=math.radians(45), name="paper")
+        "paper": Situation(motor_gain=_all_but(2), orientation_error=math.radians(45), name="paper")
     }
 
     def __init__(
@@ -176,7 +182,7 @@ class AntEnv(RobotEnv):
         """
         joint = int(rng.integers(N_JOINTS))
         yaw = rng.uniform(math.radians(15), math.radians(345))
-        return Situation(motor_gain=(1.0,) * joint + (0.0,), orientation_error=yaw)
+        return Situation(motor_gain=_all_but(joint), orientation_error=yaw)
 
     def _perturb_start(self) -> None:
         noise = self.np_random.uniform(-_START_NOISE, _START_NOISE, N_JOINTS)

@@ -233,10 +233,11 @@ def actuator_faults(env: gym.Env[Any, Any], gains: Sequence[float] = (0.0, 0.5, 
         ValueError: The actions are no one-dimensional Box of floats, or a gain lies outside [-1, 1].
     """
     low = _box("action", env.action_space).low
+    motors = range(len(low))
     return (
         Situation(),
         *(
-            Situation(motor_gain=(1.0,) * motor + (gain,))
+            Situation(motor_gain=tuple(gain if i == motor else 1.0 for i in motors))
             for gain in gains
             for motor in np.flatnonzero((low < 0.0) | (gain >= 0.0)).tolist()
         ),

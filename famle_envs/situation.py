@@ -18,8 +18,9 @@ __all__ = ["Situation", "resolve_situation"]
 class Situation:
     """A circumstance that perturbs the dynamics of a robot. Immutable, hashable, comparable.
 
-    Joints, motors, sensors and bodies are counted from 0; one beyond the end of a tuple is as built. The robots of
-    famle_envs have the first six faults; :mod:`famle_envs.faults` puts all others, and most of these, into any robot.
+    Joints, motors, sensors and bodies are counted from 0; one beyond the end of a tuple is as built, of which
+    ``motor_gain`` has to say so (``partial``). The robots of famle_envs have the first six faults;
+    :mod:`famle_envs.faults` puts all others, and most of these, into any robot.
     Two situations are equal when the same things are wrong: the name is a label and takes no part in it.
 
     Args:
@@ -41,6 +42,8 @@ class Situation:
         mass: Multiplier of the masses of all bodies, above 0.
         body_mass: Multiplier of the mass of each body, above 0.
         damping: Multiplier of the damping of all joints, above 0.
+        partial: Whether joints beyond the end of ``motor_gain`` are as built; otherwise a robot refuses one that does
+            not speak of all its joints. It is no fault.
 
     Raises:
         TypeError: A field holds something that is not a number, or not a sequence of numbers.
@@ -73,6 +76,7 @@ class Situation:
     mass: float = 1.0
     body_mass: tuple[float, ...] = ()
     damping: float = 1.0
+    partial: bool = False
 
     def __post_init__(self) -> None:
         for name in PER_PART:
@@ -83,6 +87,8 @@ class Situation:
             object.__setattr__(self, name, multiplier(name, getattr(self, name)))
         if not isinstance(self.name, str):
             raise TypeError(f"name must be a string, got {type(self.name).__name__}.")
+        if not isinstance(self.partial, bool):
+            raise TypeError(f"partial must be True or False, got {self.partial!r}.")
 
     @property
     def label(self) -> str:
@@ -100,8 +106,8 @@ class Situation:
         return frozenset(name for name, value in self.canonical().items() if value != _INTACT[name])
 
     def canonical(self) -> dict[str, Any]:
-        """Returns all fields but the name, without the parts at the end of a tuple that are as built."""
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "name"}
+        """Returns all fields that are faults, without the parts at the end of a tuple that are as built."""
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in _LABELS}
         return values | {name: _strip(values[name], entries.as_built) for name, entries in PER_PART.items()}
 
     def __eq__(self, other: object) -> bool:
@@ -116,10 +122,12 @@ class Situation:
         return describe(self.canonical(), _INTACT | {name: entries.as_built for name, entries in PER_PART.items()})
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields that differ from an intact robot, and the name, as JSON types."""
+        """The fields that differ from an intact robot, and the labels, as JSON types."""
         values = {name: getattr(self, name) for name in sorted(self.faults)}
         if self.name:
             values["name"] = self.name
+        if self.partial and "motor_gain" in values:
+            values["partial"] = True
         return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
     @classmethod
@@ -160,7 +168,7 @@ class Situation:
                 fields[name] = tuple(said.get(i, PER_PART[name].as_built) for i in range(max(said) + 1))
             else:
                 fields[name] = said[0]
-        return cls(**fields)
+        return cls(**fields, partial="motor_gain" in fields)
 
     def for_robot(
         self, robot: str, n_joints: int, supported: frozenset[str], *, n_sensors: int = 0, n_bodies: int = 0
@@ -178,7 +186,8 @@ class Situation:
             The situation with an entry for each part in all tuples.
 
         Raises:
-            ValueError: A field is not supported, a tuple is too long, or a joint does not exist.
+            ValueError: A field is not supported, a tuple is too long, or a joint does not exist; or ``motor_gain`` is
+                too short without saying so.
         """
         for fault in sorted(self.faults - supported):
             raise ValueError(
@@ -191,12 +200,17 @@ class Situation:
             if len(values) > n > 0:
                 plural = {"body": "bodies"}.get(part, f"{part}s")
                 raise ValueError(f"{name} speaks of {len(values)} {plural}; those of {robot} are 0 to {n - 1}.")
+            if name == "motor_gain" and name in self.faults and len(values) < n and not self.partial:
+                raise ValueError(
+                    f"motor_gain speaks of {len(values)} of the {n} joints of {robot}: give a gain for each; or say "
+                    f"{str(Situation(motor_gain=self.motor_gain))!r}, or partial=True, where all others are as built."
+                )
             complete[name] = values[:n] + (as_built,) * (n - len(values))
         if self.locked_joints and self.locked_joints[-1] >= n_joints:
             raise ValueError(
                 f"locked_joints names joint {self.locked_joints[-1]}; the joints of {robot} are 0 to {n_joints - 1}."
             )
-        return dataclasses.replace(self, **complete)
+        return dataclasses.replace(self, **complete, partial=False)
 
 
 def resolve_situation(
@@ -246,5 +260,8 @@ def _suggest(word: str, known: Sequence[str]) -> str:
     close = difflib.get_close_matches(word, known, n=1)
     return f"; did you mean {close[0]!r}?" if close else "."
 
+
+_LABELS = ("name", "partial")
+"""The fields that are no faults."""
 
 _INTACT = Situation().canonical()

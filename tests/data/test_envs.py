@@ -182,7 +182,7 @@ def test_dimensions_that_make_no_sense_are_refused(make_env: MakeEnv, dims: dict
 
 
 SITUATIONS: list[tuple[EnvLike, str]] = [
-    (Situation(motor_gain=(1, 1, 0)), "joint 2 dead"),
+    (Situation(partial=True, motor_gain=(1, 1, 0)), "joint 2 dead"),
     ({"locked_joints": [1]}, "joint 1 locked"),
     ("joint 4 at gain 0.5", "joint 4 at gain 0.5"),
     ("paper", "paper"),

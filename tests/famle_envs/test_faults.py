@@ -191,7 +191,7 @@ def test_situation_stays_until_it_is_changed() -> None:
 
 
 def test_name_of_a_situation_is_its_label() -> None:
-    env = FaultWrapper(Echo(), Situation(motor_gain=(0,), name="lame"))
+    env = FaultWrapper(Echo(), Situation(partial=True, motor_gain=(0,), name="lame"))
     assert env.reset()[1]["situation"] == "lame"
 
 
@@ -210,7 +210,9 @@ def test_it_draws_situations_at_random() -> None:
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_spec_makes_the_broken_robot_again_also_from_json(make_env: MakeEnv, robot: str) -> None:
-    env = make_faulty(robot, Situation(motor_gain=(0.5,), sensor_noise=(0, 0.1), name="mine"), max_episode_steps=9)
+    env = make_faulty(
+        robot, Situation(partial=True, motor_gain=(0.5,), sensor_noise=(0, 0.1), name="mine"), max_episode_steps=9
+    )
     for spec in (env.spec, EnvSpec.from_json(env.spec.to_json())):
         made = make_env(spec)
         assert made.get_wrapper_attr("situation") == env.get_wrapper_attr("situation")

@@ -28,7 +28,7 @@ MakeEnv = Callable[..., gym.Env[Any, Any]]
 
 REACHER, ANT = "FamleReacher-v0", "FamleAnt-v0"
 CLASSES: dict[str, type[RobotEnv]] = {REACHER: ReacherEnv, ANT: AntEnv}
-BROKEN = Situation(motor_gain=(-1, 1, 1, 0))
+BROKEN = Situation(partial=True, motor_gain=(-1, 1, 1, 0))
 DESCRIPTION = "joint 0 reversed, joint 3 dead"
 CHECKED = [
     *[(REACHER, name) for name in ReacherEnv.presets],
@@ -44,7 +44,7 @@ def env_id(request: pytest.FixtureRequest) -> str:
 
 @pytest.mark.parametrize(
     "written",
-    [BROKEN, {"motor_gain": [-1, 1, 1, 0]}, DESCRIPTION],
+    [BROKEN, {"motor_gain": [-1, 1, 1, 0], "partial": True}, DESCRIPTION],
     ids=["situation", "mapping", "description"],
 )
 def test_make_takes_a_situation_in_every_form(make_env: MakeEnv, env_id: str, written: Any) -> None:
@@ -69,7 +69,7 @@ def test_environment_checkers_have_no_complaint(
 
 @pytest.mark.parametrize(
     "situation",
-    [Situation(motor_gain=(0.5,), locked_joints=(3,), name="mine"), {"locked_joints": (1,)}, None],
+    [Situation(partial=True, motor_gain=(0.5,), locked_joints=(3,), name="mine"), {"locked_joints": (1,)}, None],
     ids=["situation", "mapping", "intact"],
 )
 def test_spec_makes_the_robot_again_also_from_json(make_env: MakeEnv, env_id: str, situation: Any) -> None:
@@ -82,7 +82,7 @@ def test_spec_makes_the_robot_again_also_from_json(make_env: MakeEnv, env_id: st
 
 def test_mapping_may_change_after_it_was_given(make_env: MakeEnv, env_id: str) -> None:
     gains = [0.5, 0.5]
-    env = make_env(env_id, situation={"motor_gain": gains})
+    env = make_env(env_id, situation={"motor_gain": gains, "partial": True})
     gains[0] = 0.0
     env.reset()
     assert env.unwrapped.situation == Situation(motor_gain=(0.5, 0.5))

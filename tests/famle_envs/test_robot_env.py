@@ -26,7 +26,7 @@ MakeEnv = Callable[..., gym.Env[Any, Any]]
 
 REACHER, ANT = "FamleReacher-v0", "FamleAnt-v0"
 CLASSES: dict[str, type[RobotEnv]] = {REACHER: ReacherEnv, ANT: AntEnv}
-BROKEN = Situation(motor_gain=(-1, 1, 1, 0))
+BROKEN = Situation(partial=True, motor_gain=(-1, 1, 1, 0))
 DESCRIPTION = "joint 0 reversed, joint 3 dead"
 
 

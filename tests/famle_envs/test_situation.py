@@ -37,7 +37,7 @@ SITUATIONS = st.builds(
     damping=MULTIPLIERS | st.just(1.0),
 )
 ONE_OF_EACH_FAULT = {
-    "motor_gain": Situation(motor_gain=(1, 0.5)),
+    "motor_gain": Situation(partial=True, motor_gain=(1, 0.5)),
     "locked_joints": Situation(locked_joints=(2,)),
     "joint_offset": Situation(joint_offset=(0.0, 0.1)),
     "orientation_error": Situation(orientation_error=0.3),
@@ -310,7 +310,7 @@ def test_orientation_errors_a_turn_apart_are_equal() -> None:
 
 
 def test_for_robot_completes_the_tuples_and_keeps_the_rest() -> None:
-    complete = Situation(motor_gain=(0.5,), locked_joints=(2,), name="x").for_robot(
+    complete = Situation(partial=True, motor_gain=(0.5,), locked_joints=(2,), name="x").for_robot(
         "Arm", 3, frozenset({"motor_gain", "locked_joints"})
     )
     assert complete.motor_gain == (0.5, 1.0, 1.0)
@@ -374,3 +374,20 @@ def test_resolve_refuses_an_unknown_name_with_a_suggestion_and_all_presets() -> 
 def test_resolve_refuses_other_types(written: object) -> None:
     with pytest.raises(TypeError, match=f"got {type(written).__name__}"):
         resolve_situation(written, PRESETS)
+
+
+def test_motor_gain_that_leaves_joints_out_is_refused_unless_it_says_so() -> None:
+    known = frozenset({"motor_gain"})
+    with pytest.raises(ValueError, match=r"2 of the 3 joints of Arm.*'joint 1 at gain 0\.5'.*partial=True"):
+        Situation(motor_gain=(1, 0.5)).for_robot("Arm", 3, known)
+    for situation in (Situation(motor_gain=(1, 0.5), partial=True), Situation.from_string("joint 1 at gain 0.5")):
+        for again in (situation, Situation.from_dict(json.loads(json.dumps(situation.to_dict())))):
+            assert again.for_robot("Arm", 3, known).motor_gain == (1.0, 0.5, 1.0)
+    assert Situation(motor_gain=(1, 1)).for_robot("Arm", 3, known).is_intact
+
+
+def test_partial_is_no_fault() -> None:
+    assert Situation(partial=True) == Situation()
+    assert Situation(motor_gain=(0,), partial=True).to_dict() == {"motor_gain": [0.0], "partial": True}
+    with pytest.raises(TypeError, match="partial must be True or False"):
+        Situation(partial="yes")  # type: ignore[arg-type]
