@@ -13,7 +13,7 @@ from famle_agent.adaptation.senses import Senses, Sensors
 from famle_agent.utils.deadline import Deadline
 from famle_agent.utils.errors import SensorError
 
-__all__ = ["Perception", "Safety"]
+__all__ = ["Perception", "Safety", "senses_of"]
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Perception:
 
     def begin(self, state: OnlineState, reading: Tensor, starts: Tensor) -> OnlineState:
         """Says where robots are that have taken no step since the last reading; arguments as of :meth:`Senses.at`."""
-        return replace(state, senses=self._senses(state).at(self.sensors, reading, starts))
+        return replace(state, senses=senses_of(state).at(self.sensors, reading, starts))
 
     def sense(self, state: OnlineState, reading: Tensor, moved: Tensor) -> tuple[OnlineState, Tensor]:
         """Says where robots are after the step that a state remembers.
@@ -76,13 +76,13 @@ class Perception:
         Returns:
             The state, and which robots went through a transition whose two ends were measured, (B,).
         """
-        before = self._senses(state)
+        before = senses_of(state)
         senses = before.after(self.sensors, reading, moved, lambda: self._expected(state))
         return replace(state, senses=senses), moved & before.measured & senses.measured
 
     def observe(self, state: OnlineState, transitions: Tensor) -> OnlineState:
         """Learns from the step that ends where robots are, where it is a transition (B,)."""
-        return self.controller.observe(state, self._senses(state).obs, ~transitions)
+        return self.controller.observe(state, senses_of(state).obs, ~transitions)
 
     def act(
         self, state: OnlineState, starts: Tensor, generator: torch.Generator, deadline: Deadline | None = None
@@ -92,7 +92,7 @@ class Perception:
         Raises:
             SensorError: No robot can plan, and the user has named no safe action.
         """
-        senses = self._senses(state)
+        senses = senses_of(state)
         helpless = ~senses.known | (senses.blind > self.blind_steps)
         if helpless.all() and not self.patient:
             raise SensorError(
@@ -115,12 +115,14 @@ class Perception:
     def _expected(self, state: OnlineState) -> Tensor:
         """Predicts where the last action led, (B, obs_dim), a mean over the ensemble; angles are not wrapped."""
         if state.last is None:
-            return self._senses(state).obs
+            return senses_of(state).obs
         obs, action = state.last
         model = self.controller.adapter.model_for(state.belief, state.memory)
         return model(obs[:, None], action[:, None]).mean(dim=1)[:, 0]
 
-    def _senses(self, state: OnlineState) -> Senses:
-        if state.senses is not None:
-            return state.senses
-        return Senses.none(state.robots, self.sensors.model.obs_dim, state.plan.device)
+
+def senses_of(state: OnlineState) -> Senses:
+    """Returns what the sensors of a state's robots have said; nothing where nobody has asked."""
+    if state.senses is not None:
+        return state.senses
+    return Senses.none(state.robots, state.memory.obs.shape[2], state.plan.device)

@@ -25,7 +25,7 @@ from famle_agent.adaptation.adapters import EmbeddingAdapter, GradientAdapter
 from famle_agent.adaptation.belief import Belief
 from famle_agent.adaptation.controller import Adapter, Controller, OnlineState
 from famle_agent.adaptation.diagnosis import Diagnosis
-from famle_agent.adaptation.perception import Perception
+from famle_agent.adaptation.perception import Perception, senses_of
 from famle_agent.adaptation.senses import Senses
 from famle_agent.agents.check import Check, check_plans
 from famle_agent.agents.config import Config
@@ -473,14 +473,14 @@ class ModelBasedAgent(StoredAgent):
             try:
                 step = vec_step(env, to_action_space(action, self.action_space))
             except BaseException:
-                self._senses = _dropping(state, torch.ones_like(starts))
+                self._senses = senses_of(state).dropping(torch.ones_like(starts))
                 raise
             self.num_timesteps, self._calls = self.num_timesteps + env.num_envs, watch.calls
             new_obs, rewards, dones, infos = step.obs, step.rewards, step.dones, step.infos  # by names callbacks know
             reset_alone = watch.resets() - resets != dones if len(resets) else np.zeros_like(dones)
             lost = torch.as_tensor(reset_alone | ~step.known, device=self.device)
             state, transitions = perception.sense(state, self.policy.builder.tensor(step.reached), ~lost)
-            state = replace(state, senses=_dropping(state, lost))
+            state = replace(state, senses=senses_of(state).dropping(lost))
             state = self._live = self._observed(perception.observe(state, transitions))
             self._senses = state.senses
             self._last_obs, self._last_episode_starts = new_obs, dones | reset_alone
@@ -513,7 +513,7 @@ class ModelBasedAgent(StoredAgent):
             self.logger.record("adapt/situation", most_likely, exclude="tensorboard")
             log_posterior(self.logger, self.marginals())
             log_adaptations(self.logger, self._live.belief)
-            log_health(self.logger, _senses(self._live).counts, self.overruns, self.cut_short)
+            log_health(self.logger, senses_of(self._live).counts, self.overruns, self.cut_short)
         since_start = self.num_timesteps - self._num_timesteps_at_start
         log_time(self.logger, self.num_timesteps, since_start, self._episode_num, self.start_time)
         self.logger.dump(self.num_timesteps)
@@ -623,7 +623,7 @@ class ModelBasedAgent(StoredAgent):
             return perception.observe(sensed, transitions)
         (s, a, s_next), (last_s, last_a) = self._told, state.last
         same_step = torch.equal(s, last_s) and torch.allclose(a, last_a, atol=1e-5)
-        if not (same_step and torch.equal(s_next[~starts], _senses(sensed).obs[~starts])):
+        if not (same_step and torch.equal(s_next[~starts], senses_of(sensed).obs[~starts])):
             return perception.observe(sensed, transitions)
         return replace(self._live, plan=state.plan, last=None, senses=self._senses)
 
@@ -650,9 +650,9 @@ class ModelBasedAgent(StoredAgent):
         a = self.policy.builder.action_scale.to_unit(a).clamp(-1.0, 1.0)
         everyone = torch.ones(len(s), dtype=torch.bool, device=self.device)
         state = perception.begin(self.state_of(len(s)), s, ~everyone)
-        s = _senses(state).obs
+        s = senses_of(state).obs
         state, transitions = perception.sense(replace(state, last=(s, a)), s_next, everyone)
-        self._told = s, a, _senses(state).obs
+        self._told = s, a, senses_of(state).obs
         self._live = self._observed(perception.observe(state, transitions))
         self._senses = self._live.senses
 
@@ -671,7 +671,7 @@ class ModelBasedAgent(StoredAgent):
         readings = self.policy.builder.tensor(np.atleast_2d(reading(obs, self.observation_space)))
         everyone = torch.ones(len(readings), dtype=torch.bool, device=self.device)
         state = self.perception.begin(self.state_of(len(readings)), readings, everyone)
-        self._senses = _dropping(state, everyone & dropped)
+        self._senses = senses_of(state).dropping(everyone & dropped)
 
     @torch.inference_mode(mode=False)
     def begin_episode(self) -> None:
@@ -770,7 +770,7 @@ class ModelBasedAgent(StoredAgent):
         """
         senses = self._senses if state is None else state.senses
         if senses is None:
-            senses = _senses(self._state_for(state, robot))
+            senses = senses_of(self._state_for(state, robot))
         if not 0 <= robot < senses.robots:
             raise IndexError(f"There are robots 0 to {senses.robots - 1}, not {robot}.")
         counts = {name: int(count[robot]) for name, count in senses.counts.items()}
@@ -831,18 +831,6 @@ def _check_policy(env: object, policy: object) -> None:
         raise ValueError(f"The environment comes first, and a policy may follow by name: (env, policy={env!r}).")
     if policy not in (None, "MlpPolicy"):
         raise ValueError(f"policy must be 'MlpPolicy' or None, got {policy!r}: the agent plans, and learns no other.")
-
-
-def _senses(state: OnlineState) -> Senses:
-    """What the sensors of a state's robots have said; nothing where nobody has asked."""
-    if state.senses is not None:
-        return state.senses
-    return Senses.none(state.robots, state.memory.obs.shape[2], state.plan.device)
-
-
-def _dropping(state: OnlineState, dropped: torch.Tensor) -> Senses:
-    """The same, with a step of some robots (B,) that was no transition."""
-    return _senses(state).dropping(dropped)
 
 
 def _description(env: VecEnv) -> dict[str, Any] | None:

@@ -30,7 +30,7 @@ GAIN, DIM = 0.05, 3
 class Cart(gym.Env[Any, Any]):
     """Moves by a twentieth of its action, and observes by sensors that the test breaks."""
 
-    observation_space = spaces.Box(-10.0, 10.0, (DIM,))
+    observation_space = spaces.Box(np.float32([-10.0, -10.0, -np.inf]), np.float32([10.0, 10.0, np.inf]))
     action_space = spaces.Box(np.float32([-2.0, -1.0]), np.float32([2.0, 3.0]))
 
     def __init__(self, gain: float = 1.0, sense: Callable[[int, Array], Any] = lambda step, obs: obs) -> None:
