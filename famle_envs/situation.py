@@ -251,9 +251,8 @@ def resolve_situation(
 
 
 def _strip(values: tuple[Any, ...], default: Any) -> tuple[Any, ...]:
-    while values and values[-1] == default:
-        values = values[:-1]
-    return values
+    wrong = (i for i in range(len(values), 0, -1) if values[i - 1] != default)
+    return values[: next(wrong, 0)]
 
 
 def _suggest(word: str, known: Sequence[str]) -> str:

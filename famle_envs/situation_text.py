@@ -123,7 +123,7 @@ _OF_THE_ROBOT = {"orientation_error", "friction", "base_mass", "mass", "damping"
 
 def _pattern(text: str) -> re.Pattern[str]:
     """A clause in which ``#`` is an index and ``@`` a number."""
-    number = r"(-?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)"
+    number = r"(-?(?:\d+(?:\.\d*)?|\.\d+)(?:e[+-]?\d+)?)"  # digits in one way only, or long ones would take for ever
     return re.compile(text.replace("#", r"(\d+)").replace("@", number), re.ASCII)
 
 

@@ -391,3 +391,28 @@ def test_partial_is_no_fault() -> None:
     assert Situation(motor_gain=(0,), partial=True).to_dict() == {"motor_gain": [0.0], "partial": True}
     with pytest.raises(TypeError, match="partial must be True or False"):
         Situation(partial="yes")  # type: ignore[arg-type]
+
+
+# --- text of any length -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"friction x {'1' * 50_000}z",
+        f"friction x {'1' * 50_000}",
+        f"joint {'1' * 50_000} dead",
+        f"motor 0 delayed by {'1' * 50_000} steps",
+        f"sensor 0 noise 0.{'1' * 50_000}e",
+        ",".join(["joint 1"] * 5_000),
+        " " * 50_000,
+    ],
+    ids=lambda text: text[:20],
+)
+def test_long_text_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"\w"):
+        Situation.from_string(text)  # which takes minutes where the time grows with the square of the length
+
+
+def test_many_parts_are_read() -> None:
+    assert Situation(motor_gain=(0.0, *(1.0,) * 200_000)) == Situation(motor_gain=(0.0,))
