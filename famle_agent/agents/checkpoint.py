@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import io
-import json
 import os
-import zipfile
-import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
+from operator import index
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Any, BinaryIO
@@ -16,30 +14,33 @@ from typing import Any, BinaryIO
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from famle_agent.agents.config import Config
 from famle_agent.agents.presets import known_robots
 from famle_agent.models.observation import DIMS
+from famle_agent.utils.archive import pack, unpack
 from famle_agent.utils.atomic_write import whole_file
 
 __all__ = ["Checkpoint", "File", "check_writable", "joined", "read_checkpoint", "write_checkpoint"]
 
 _FORMAT = "famle-agent"
 _VERSION = 2
-_DAMAGE = (
-    *(zipfile.BadZipFile, zlib.error, EOFError, KeyError, SafetensorError),
-    *(ValueError, RuntimeError, NotImplementedError),  # what zipfile and json make of flipped bits
-)
 _OPTIONAL: Mapping[str, Any] = {
     **dict.fromkeys(("env", "seed", "live", "tensorboard_log")),
     **dict.fromkeys(("num_timesteps", "episodes", "verbose"), 0),
 }
 """What a file can go without, and what stands in its place."""
-_META, _TENSORS = "agent.json", "tensors.safetensors"
+_META = "agent.json"
+_TYPES: Mapping[str, tuple[type, ...]] = {
+    **dict.fromkeys(("class", "mode"), (str,)),
+    **dict.fromkeys(("hyperparameters", "observation_space", "action_space"), (dict,)),
+    **dict.fromkeys(("needs_reward_fn", "needs_termination_fn"), (bool,)),
+    **dict.fromkeys(("num_timesteps", "episodes", "verbose"), (int,)),
+    **dict.fromkeys(("env", "live"), (dict, type(None))),
+    **{"situations": (list,), "seed": (int, type(None)), "tensorboard_log": (str, type(None))},
+}
+"""What the parts of a description are, where it has them."""
 
 File = str | os.PathLike[str] | BinaryIO
 
@@ -52,13 +53,14 @@ def write_checkpoint(file: File, meta: dict[str, Any], tensors: dict[str, Tensor
         meta: What JSON can say.
         tensors: What it cannot.
     """
+    content = pack({"format": _FORMAT, "version": _VERSION, **meta}, tensors, _META)
     if not isinstance(file, (str, os.PathLike)):
-        file.write(_pack(meta, tensors))
+        file.write(content)
         return
     path = _with_suffix(file)
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as partial:
-        partial.write_bytes(_pack(meta, tensors))
+        partial.write_bytes(content)
 
 
 def check_writable(file: str | os.PathLike[str]) -> None:
@@ -89,10 +91,8 @@ def read_checkpoint(file: File) -> tuple[dict[str, Any], dict[str, Tensor]]:
     else:
         path, source = Path("the file"), file
     try:
-        with zipfile.ZipFile(source) as archive:
-            meta = json.loads(archive.read(_META))
-            tensors = load_tensors(archive.read(_TENSORS))
-    except _DAMAGE as error:
+        meta, tensors = unpack(source, _META)
+    except ValueError as error:
         raise ValueError(
             f"{path} is no FAMLE checkpoint, or it is damaged ({error}). "
             "Give a file written by agent.save(); Stable-Baselines3's own zip files are another format."
@@ -180,28 +180,29 @@ class Checkpoint:
         """
         meta, tensors = read_checkpoint(file)
         try:
+            _check_types(meta)
             if not any(meta["mode"] in robot.modes for robot in known_robots().values()):
                 raise ValueError(f"no robot has a mode {meta['mode']!r}")
             return cls(
-                kind=str(meta["class"]),
+                kind=meta["class"],
                 mode=meta["mode"],
                 config=Config.of(meta["hyperparameters"]),
                 observation_space=box_from_json(meta["observation_space"]),
                 action_space=box_from_json(meta["action_space"]),
-                dims={name: tuple(meta.get(name, ())) for name in DIMS},
-                situations=tuple(str(name) for name in list(meta["situations"])),
+                dims={name: tuple(map(index, meta.get(name, ()))) for name in DIMS},
+                situations=tuple(str(name) for name in meta["situations"]),
                 env=meta["env"],
                 needs_reward_fn=meta["needs_reward_fn"],
                 needs_termination_fn=meta.get("needs_termination_fn", False),  # which version 0.1 did not know
                 seed=meta["seed"],
-                num_timesteps=int(meta.get("num_timesteps", 0)),
-                episodes=int(meta.get("episodes", 0)),
+                num_timesteps=meta.get("num_timesteps", 0),
+                episodes=meta.get("episodes", 0),
                 live=meta["live"],
                 tensors=tensors,
-                verbose=int(meta.get("verbose", 0)),
+                verbose=meta.get("verbose", 0),
                 tensorboard_log=meta.get("tensorboard_log"),
             )
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
             raise ValueError(
                 f"The file is no FAMLE checkpoint that this package knows: its description of the agent is damaged or "
                 f"of another version ({error!r}). Save the agent again."
@@ -292,8 +293,15 @@ class Checkpoint:
             if not isinstance(entry_point, str) or not entry_point.startswith("famle_envs."):
                 return None
             return gym.make(name, max_episode_steps=limit, **kwargs)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, gym.error.Error) as error:
             raise ValueError(f"The file's environment cannot be made ({error!r}); give load(..., env=...).") from error
+
+
+def _check_types(meta: Mapping[str, Any]) -> None:
+    """Refuses a description of which a part is of another type."""
+    for name, kinds in _TYPES.items():
+        if name in meta and not isinstance(meta[name], kinds):
+            raise ValueError(f"{name} is a {type(meta[name]).__name__}")
 
 
 def joined(**parts: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -311,20 +319,17 @@ def box_to_json(space: spaces.Box) -> dict[str, Any]:
 
 
 def box_from_json(values: dict[str, Any]) -> spaces.Box:
-    """The inverse of :func:`box_to_json`."""
+    """The inverse of :func:`box_to_json`.
+
+    Raises:
+        ValueError: The numbers of the space are of no kind that a robot has.
+    """
     dtype, shape = np.dtype(values["dtype"]), tuple(values["shape"])
+    if dtype.kind not in "iuf" or len(shape) != 1:
+        raise ValueError(f"a space of {dtype} {shape}")
     low = np.array([-np.inf if value is None else value for value in values["low"]], dtype=dtype).reshape(shape)
     high = np.array([np.inf if value is None else value for value in values["high"]], dtype=dtype).reshape(shape)
     return spaces.Box(low, high, dtype=dtype)
-
-
-def _pack(meta: dict[str, Any], tensors: dict[str, Tensor]) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr(_META, json.dumps({"format": _FORMAT, "version": _VERSION, **meta}, indent=1))
-        contiguous = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
-        archive.writestr(_TENSORS, save_tensors(contiguous))
-    return buffer.getvalue()
 
 
 def _with_suffix(file: str | os.PathLike[str]) -> Path:

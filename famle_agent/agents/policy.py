@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from famle_agent.adaptation.adapters import EmbeddingAdapter, GradientAdapter
+from famle_agent.adaptation.belief import Belief
 from famle_agent.adaptation.controller import Adapter, Controller, OnlineState
 from famle_agent.adaptation.guide import Guide
 from famle_agent.adaptation.memory import Memory
@@ -155,17 +156,30 @@ class AdaptivePolicy:
         Raises:
             NotLearnedError: There is no model yet.
         """
-        model, how, belief = self.model, self.config.adaptation, self.adapter.initial(robots)
-        sizes = how.memory_size, model.obs_dim, model.action_dim, belief.log_posterior.shape[1]
-        return self.controller.init(belief, Memory.empty(robots, *sizes, belief.log_posterior.device, how.window))
+        belief = self.adapter.initial(robots)
+        return self.controller.init(belief, self._no_memory(belief))
+
+    def _no_memory(self, belief: Belief) -> Memory:
+        """The memory of robots that have seen nothing."""
+        model, how, (robots, candidates) = self.model, self.config.adaptation, belief.log_posterior.shape
+        sizes = how.memory_size, model.obs_dim, model.action_dim, candidates
+        return Memory.empty(robots, *sizes, belief.log_posterior.device, how.window)
 
     def stored_state(self, tensors: dict[str, Tensor], counts: dict[str, int]) -> OnlineState | None:
-        """Returns the state that a file holds, for the settings of now; None where they cannot go on from it."""
+        """Returns the state that a file holds, for the settings of now; None where they cannot go on from it.
+
+        Raises:
+            LookupError: Something is missing.
+            RuntimeError: It is of another shape.
+        """
         how = self.config.adaptation
         state = OnlineState.from_tensors({name: value.to(self.device) for name, value in tensors.items()}, **counts)
         state = state.resized(how.memory_size, how.window, self.config.planner.horizon)
         # With other candidates than the stored agent's, what it has seen cannot be judged by what it knew of them.
-        if state.belief.log_posterior.shape == self.adapter.initial(state.robots).log_posterior.shape:
+        belief = self.adapter.initial(state.robots)
+        if state.belief.log_posterior.shape == belief.log_posterior.shape:
+            memory, plan = self._no_memory(belief), belief.h.new_zeros(*state.plan.shape[:2], self.model.action_dim)
+            _check_shapes(state, OnlineState(memory, belief, plan))
             return state
         warnings.warn(
             "What the stored agent believed of its robot is left behind: it told other situations apart than these "
@@ -207,3 +221,14 @@ class AdaptivePolicy:
         if self.world is None or self.world.reward is None:
             raise ValueError("The agent has no reward; give load() the environment (env=...) or a reward_fn.")
         return self.world.reward
+
+
+def _check_shapes(state: OnlineState, expected: OnlineState) -> None:
+    """Refuses a state that is of other robots, or of another model.
+
+    Raises:
+        RuntimeError: It is.
+    """
+    shapes, fitting = ({name: value.shape for name, value in s.to_tensors().items()} for s in (state, expected))
+    if differing := sorted(name for name in shapes.keys() | fitting.keys() if shapes.get(name) != fitting.get(name)):
+        raise RuntimeError(f"What was believed has other shapes: {', '.join(differing)}.")

@@ -242,7 +242,7 @@ class StoredAgent(BaseAlgorithm):
                 self._live = policy.stored_state(stored.part("live"), stored.live)
             if self.device.type == "cpu" and (generator := stored.part("generator")):
                 self.generator.set_state(generator["state"])
-        except (KeyError, RuntimeError, TypeError) as error:
+        except (LookupError, RuntimeError, TypeError, ValueError) as error:
             policy.world, self._live = known  # nothing is half-taken
             raise ValueError(
                 "The file's weights do not fit its settings; it is damaged, or an override changed the network: "

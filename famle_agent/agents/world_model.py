@@ -165,14 +165,18 @@ class ModelBuilder:
             RuntimeError: The weights are of another architecture.
         """
         robots = max(1, len(weights["dynamics"]["embeddings"]) // self.config.members)
+        on_paper = replace(self, device=torch.device("meta"))
+        with on_paper.device:  # which takes no memory, of which settings that do not fit may ask for very much
+            for name, part in on_paper.untrained(weights, situations, robots).items():
+                part.load_state_dict(weights[name], assign=True)
         with GlobalChance(0)():  # initial weights, which are replaced
-            parts = self._untrained(weights, situations, robots)
+            parts = self.untrained(weights, situations, robots)
         for name, part in parts.items():
             part.load_state_dict(weights[name])
             part.requires_grad_(name == "dynamics")
         return WorldModel(situations=situations, **parts)
 
-    def _untrained(
+    def untrained(
         self, weights: Mapping[str, dict[str, Tensor]], situations: tuple[str, ...], robots: int
     ) -> dict[str, Any]:
         """Makes the parts that there are weights of."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import zipfile
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from famle_agent.data.gate import floats
+from famle_agent.utils.archive import DAMAGE, check_sizes
 from famle_agent.utils.atomic_write import whole_file
 
 __all__ = ["EnvSource", "Transitions", "check_names"]
@@ -136,17 +135,10 @@ class Transitions:
         """
         try:
             with np.load(path, allow_pickle=False) as archive:
+                check_sizes(archive.zip, os.path.getsize(path))
                 arrays = {name: archive[name] for name in ("obs", "action", "reward", "next_obs")}
                 situations = tuple(str(name) for name in archive["situations"])
                 ended = archive.get("terminated")
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            EOFError,
-            KeyError,
-            NotImplementedError,
-            TypeError,
-            ValueError,
-        ) as error:
+        except DAMAGE as error:
             raise ValueError(f"{path} holds no transitions, or not all of them; collect them again.") from error
         return cls(**arrays, situations=situations, terminated=ended)

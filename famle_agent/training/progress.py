@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import io
-import pickle
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
+from torch import Tensor
 
+from famle_agent.utils.archive import DAMAGE, pack, unpack
 from famle_agent.utils.atomic_write import whole_file
 
 __all__ = ["Progress", "Stateful"]
+
+_STATES = "progress.json"
 
 
 class Stateful(Protocol):
@@ -64,12 +67,12 @@ class Progress:
             return 0
         content = io.BytesIO(self._file.read_bytes())
         try:
-            saved = torch.load(content, map_location="cpu", weights_only=True)
+            saved = _with_tensors(*unpack(content, _STATES))
             for name, part in parts.items():
                 part.load_state_dict(saved[name])
             generator.set_state(saved["generator"])
             done = int(saved["done"])
-        except (EOFError, KeyError, RuntimeError, TypeError, ValueError, pickle.UnpicklingError) as error:
+        except DAMAGE as error:
             raise ValueError(
                 f"{self._file} is damaged, or of another run ({error!r}). Delete it to begin anew."
             ) from error
@@ -80,5 +83,31 @@ class Progress:
         if self._file is None:
             return
         states = {name: part.state_dict() for name, part in parts.items()}
+        tensors: dict[str, Tensor] = {}
+        described = _without_tensors({"done": done, "generator": generator.get_state(), **states}, tensors)
         with whole_file(self._file) as file:
-            torch.save({"done": done, "generator": generator.get_state(), **states}, file)
+            file.write_bytes(pack(described, tensors, _STATES))
+
+
+def _without_tensors(state: Any, tensors: dict[str, Tensor]) -> Any:
+    """A state as JSON types: a mapping is a list of pairs under "items", a tensor its name under "tensor"."""
+    if isinstance(state, Tensor):
+        name = f"{len(tensors)}"
+        tensors[name] = state
+        return {"tensor": name}
+    if isinstance(state, Mapping):
+        return {"items": [[key, _without_tensors(value, tensors)] for key, value in state.items()]}
+    if isinstance(state, (list, tuple)):
+        return [_without_tensors(value, tensors) for value in state]
+    return state
+
+
+def _with_tensors(described: Any, tensors: Mapping[str, Tensor]) -> Any:
+    """The inverse of :func:`_without_tensors`, but that tuples are lists."""
+    if isinstance(described, list):
+        return [_with_tensors(value, tensors) for value in described]
+    if isinstance(described, dict):
+        if "tensor" in described:
+            return tensors[described["tensor"]]
+        return {key: _with_tensors(value, tensors) for key, value in described["items"]}
+    return described

@@ -3,6 +3,7 @@ from __future__ import annotations
 import io
 import json
 import sys
+import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import PPO
 
-import famle_agent.agents.checkpoint
+import famle_agent.utils.archive
 from famle_agent import AMPCMAML, FAMLE
 from famle_agent.agents.checkpoint import read_checkpoint, write_checkpoint
 
@@ -68,7 +69,7 @@ def test_failed_save_leaves_the_old_file(
                 file.write(args[1][: len(args[1]) // 2])
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(famle_agent.agents.checkpoint if failing == "save_tensors" else Path, failing, fail)
+    monkeypatch.setattr(famle_agent.utils.archive if failing == "save_tensors" else Path, failing, fail)
     quick_agent.learn(3)
     with pytest.raises(OSError, match="No space left"):
         quick_agent.save(path)
@@ -165,6 +166,14 @@ def test_file_of_another_kind_is_refused(
         {"live": {"steps": 1, "adaptations": 1}},
         {"action_space": {}},
         {"situations": 3},
+        {"seed": "7"},
+        {"num_timesteps": float("inf")},
+        {"tensorboard_log": 5},
+        {"class": []},
+        {"angle_dims": ["x"]},
+        {"env": {"id": "FamleReacher-v0", "kwargs": {"situation": {"motor_gain": [1] * 100_000}}}},
+        {"env": {"id": "FamleReacher-v0", "kwargs": {"render_mode": "hologram"}}},
+        *({"observation_space": {"low": [0], "high": [1], "shape": [1], "dtype": d}} for d in ("O", "V100000000", "?")),
     ],
     ids="-".join,
 )
@@ -172,6 +181,32 @@ def test_file_that_makes_no_sense_is_refused(agent_file: Path, tmp_path: Path, c
     path = rewrite(agent_file, tmp_path / "odd.zip", lambda meta: meta.update(change))
     with pytest.raises(ValueError, match=r"\w"):
         FAMLE.load(path, device="cpu")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"hidden": [10**5, 10**5]}, {"hidden": [10**19]}, {"members": 10**8}, {"embedding_dim": 10**10}],
+    ids="-".join,
+)
+def test_file_cannot_ask_for_a_network_that_it_does_not_hold(
+    agent_file: Path, tmp_path: Path, settings: dict[str, Any]
+) -> None:
+    path = rewrite(agent_file, tmp_path / "odd.zip", lambda meta: meta["hyperparameters"].update(settings))
+    start = time.perf_counter()
+    with pytest.raises(ValueError, match="do not fit"):
+        FAMLE.load(path, device="cpu")
+    assert time.perf_counter() - start < 10.0  # the largest one, were it made, would not end
+
+
+@pytest.mark.parametrize("name", ["h", "plan", "memory.obs", "theta.weight_0", "candidate"])
+def test_belief_of_another_shape_is_refused(quick_agent: FAMLE, tmp_path: Path, name: str) -> None:
+    quick_agent.learn(3)
+    quick_agent.save(tmp_path / "agent.zip")
+    meta, tensors = read_checkpoint(tmp_path / "agent.zip")
+    tensors[f"live/{name}"] = tensors[f"live/{name}"].repeat_interleave(2, dim=-1)
+    write_checkpoint(tmp_path / "odd.zip", {k: v for k, v in meta.items() if k not in ("format", "version")}, tensors)
+    with pytest.raises(ValueError, match="do not fit"):
+        FAMLE.load(tmp_path / "odd.zip", device="cpu")
 
 
 @pytest.mark.parametrize("env_id", ["NoSuch-v0", "os:system", "famle_poison:Env-v0"])

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -96,9 +97,25 @@ def npy(array: Any) -> bytes:
 GOOD = {name: getattr(some_transitions(), name) for name in ("obs", "action", "reward", "next_obs", "situations")}
 
 
+def claiming(shape: tuple[int, ...], dtype: str = "<f4", padding: bytes = b"") -> bytes:
+    """A file whose observations say that they have a shape, and are padding."""
+    header, buffer = io.BytesIO(), io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": dtype, "fortran_order": False, "shape": shape})
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("obs.npy", header.getvalue() + padding)
+    return buffer.getvalue()
+
+
 @pytest.mark.parametrize(
     "content",
     [
+        claiming((10**13,)),
+        claiming((10**9, 10)),
+        claiming((10**30,)),
+        claiming((-5,)),
+        claiming((2**28,), "|u1", bytes(2**28)),
+        claiming((1,), "|O"),
+        b"\x93NUMPY\x01\x00" + (5000).to_bytes(2, "little") + b"(" * 5000,
         b"hello",
         npz(weights=np.ones(3)),
         npy(np.ones(3)),
@@ -108,7 +125,10 @@ GOOD = {name: getattr(some_transitions(), name) for name in ("obs", "action", "r
         npz(**{**GOOD, "reward": np.zeros((2, 4), np.float32)}),
         npz(**{**GOOD, "action": np.full((2, 3, 1), np.nan, np.float32)}),
     ],
-    ids=["text", "other arrays", "one array", "pickle", "strings", "one situation", "shape", "NaN"],
+    ids=[
+        *("36 TiB", "37 GiB", "too many", "negative", "bomb", "objects", "deep header"),
+        *("text", "other arrays", "one array", "pickle", "strings", "one situation", "shape", "NaN"),
+    ],
 )
 def test_foreign_file_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "data.npz").write_bytes(content)

@@ -66,7 +66,7 @@ def assert_same(one: Dynamics, other: Dynamics) -> None:
 def test_stopped_learner_goes_on_to_the_same_model(name: str, stop_after: int, tmp_path: Path) -> None:
     whole, generator, _ = learnt(name, Progress())
     skipped: list[int] = []
-    progress = Progress(tmp_path / "it.pt", skipped.append, every=0.0)
+    progress = Progress(tmp_path / "it.progress", skipped.append, every=0.0)
     stopped, _, before = learnt(name, progress, stop_after)
     assert before == stop_after - 1
     model, went_on, after = learnt(name, progress)
@@ -79,7 +79,7 @@ def test_stopped_learner_goes_on_to_the_same_model(name: str, stop_after: int, t
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_finished_learner_does_nothing_again(name: str, tmp_path: Path) -> None:
-    progress = Progress(tmp_path / "it.pt")
+    progress = Progress(tmp_path / "it.progress")
     whole, generator, _ = learnt(name, progress)
     again, went_on, done = learnt(name, progress)
     assert done == 0
@@ -90,7 +90,7 @@ def test_finished_learner_does_nothing_again(name: str, tmp_path: Path) -> None:
 def test_saves_now_and_then_and_in_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr("famle_agent.training.progress.time.perf_counter", lambda: now[0])
-    file, saved = tmp_path / "it.pt", list[int]()
+    file, saved = tmp_path / "it.progress", list[int]()
     generator = torch.Generator()
     for iteration in Progress(file, every=10.0).iterations(8, generator):
         saved += [iteration] * file.exists()
@@ -98,7 +98,7 @@ def test_saves_now_and_then_and_in_the_end(tmp_path: Path, monkeypatch: pytest.M
         now[0] += 4.0
     assert saved == [3, 6]  # after 12 and 24 seconds
     assert list(Progress(file).iterations(8, generator)) == []
-    assert [path.name for path in tmp_path.iterdir()] == ["it.pt"]
+    assert [path.name for path in tmp_path.iterdir()] == ["it.progress"]
 
 
 def test_without_a_file_nothing_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,33 +110,34 @@ def test_without_a_file_nothing_is_kept(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_failed_write_keeps_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    progress = Progress(tmp_path / "it.pt", every=0.0)
+    progress = Progress(tmp_path / "it.progress", every=0.0)
     whole, _, _ = learnt("joint", Progress())
     learnt("joint", progress, stop_after=3)
-    before = (tmp_path / "it.pt").read_bytes()
+    before = (tmp_path / "it.progress").read_bytes()
 
-    def fail(_: object, file: Path) -> None:
-        file.write_bytes(before[:100])
+    def fail(file: Path, content: bytes) -> None:
+        with file.open("wb") as partial:
+            partial.write(content[:100])
         raise OSError("No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(torch, "save", fail)
+        patch.setattr(Path, "write_bytes", fail)
         with pytest.raises(OSError, match="No space left"):
             learnt("joint", progress)
-    assert (tmp_path / "it.pt").read_bytes() == before
+    assert (tmp_path / "it.progress").read_bytes() == before
     assert_same(learnt("joint", progress)[0], whole)
 
 
 @pytest.mark.parametrize("size", [0, 1, 100, -1])
 def test_damaged_file_is_named(size: int, tmp_path: Path) -> None:
-    file = tmp_path / "it.pt"
+    file = tmp_path / "it.progress"
     learnt("joint", Progress(file))
     file.write_bytes(file.read_bytes()[:size])
-    with pytest.raises(ValueError, match=r"it\.pt is damaged, or of another run .* Delete it"):
+    with pytest.raises(ValueError, match=r"it\.progress is damaged, or of another run .* Delete it"):
         learnt("joint", Progress(file))
 
 
 def test_file_of_another_learner_is_refused(tmp_path: Path) -> None:
-    learnt("reptile", Progress(tmp_path / "it.pt"))
+    learnt("reptile", Progress(tmp_path / "it.progress"))
     with pytest.raises(ValueError, match="of another run"):
-        learnt("joint", Progress(tmp_path / "it.pt"))
+        learnt("joint", Progress(tmp_path / "it.progress"))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -46,3 +47,11 @@ def test_threads_may_write_the_same_file(tmp_path: Path) -> None:
         list(threads.map(write, "abcd"))
     assert path.read_text() in {text * 1000 for text in "abcd"}
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_content_is_on_the_disk_before_it_has_the_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, synced = tmp_path / "file.txt", list[bool]()
+    monkeypatch.setattr(os, "fsync", lambda _: synced.append(path.exists()))
+    with whole_file(path) as partial:
+        partial.write_text("new")
+    assert synced == [False]
