@@ -44,6 +44,7 @@ from famle_agent.data.envs import (
     check_spaces,
     env_id,
     env_spec,
+    first_env,
     other_reward,
     planning_reward,
     planning_termination,
@@ -51,6 +52,7 @@ from famle_agent.data.envs import (
     special_dims,
 )
 from famle_agent.data.gate import check_action, reading, vec_readings, vec_step
+from famle_agent.data.identity import identity
 from famle_agent.data.policies import MakePolicy, reward_names
 from famle_agent.data.probe import check_reward_fn, check_termination_fn
 from famle_agent.data.transitions import Transitions, check_names
@@ -404,9 +406,11 @@ class ModelBasedAgent(StoredAgent):
             "agent": type(self).__name__,
             "env": self._env_spec,
             "dimensions": {name: list(dims) for name, dims in self.dims.items()},
-            "needs_reward_fn": self.policy.user_reward_fn is not None,
-            "needs_termination_fn": self.policy.user_termination_fn is not None,
+            "environment": None if self.env is None else identity(first_env(self.env)),
+            "reward_fn": identity(self.policy.user_reward_fn),
+            "termination_fn": identity(self.policy.user_termination_fn),
             "seed": self.seed,
+            "sources": None if isinstance(source, Transitions) else identity(source.sources),
             "situations": list(source.situations),
             "transitions": source.digest() if isinstance(source, Transitions) else None,
             "hyperparameters": {name: value for name, value in self.config.to_dict().items() if name not in SAFETY},

@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -139,7 +141,10 @@ def search_policy(
     if data is not None and weights is not None and weights.exists():
         with GlobalChance(0)():  # initial weights, which are replaced
             actor_critic = builder.actor_critic(len(envs.situations), settings.hidden)
-        actor_critic.load_state_dict(load_file(weights))
+        try:
+            actor_critic.load_state_dict(load_tensors(weights.read_bytes()))
+        except (KeyError, RuntimeError, SafetensorError) as error:
+            raise ValueError(f"{weights} is damaged ({error}). Delete it to begin anew.") from error
         return Transitions.load(data), actor_critic.requires_grad_(False)
     search = Search(settings, envs.sources, envs.situations, seed, simulation.episode_length)
     try:
@@ -154,7 +159,7 @@ def search_policy(
     if data is not None and weights is not None:
         transitions.save(data)
         with whole_file(weights) as partial_file:
-            save_file(actor_critic.state_dict(), partial_file)
+            partial_file.write_bytes(save_tensors(actor_critic.state_dict()))
     return transitions, actor_critic.to(builder.device)
 
 

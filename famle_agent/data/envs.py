@@ -28,6 +28,7 @@ from famle_envs.profile import Profile
 from famle_envs.situation import Situation
 
 __all__ = [
+    "ONLOOKERS",
     "EnvLike",
     "SituationEnvs",
     "SituationsLike",
@@ -36,6 +37,7 @@ __all__ = [
     "env_attribute",
     "env_id",
     "env_spec",
+    "first_env",
     "other_reward",
     "planning_reward",
     "planning_termination",
@@ -101,7 +103,7 @@ def env_spec(env: VecEnv) -> dict[str, Any] | None:
     return {"id": spec.id, "kwargs": kwargs, "max_episode_steps": spec.max_episode_steps}
 
 
-_ONLOOKERS = frozenset({"Monitor", "RecordEpisodeStatistics", "RecordVideo", "HumanRendering"})
+ONLOOKERS = frozenset({"Monitor", "RecordEpisodeStatistics", "RecordVideo", "HumanRendering"})
 """Wrappers that change nothing of what a robot and its agent tell each other."""
 _FAULTS = frozenset({FaultWrapper.class_name()})
 """What it changes is inside the robot: an observation means the same, be it wrong or not."""
@@ -146,7 +148,7 @@ def _defaults(spec: EnvSpec) -> dict[str, Any]:
     return {name: _plain(value) for name, value in {**named, **spec.kwargs}.items()}
 
 
-def _plain_spec(env: VecEnv, wrappers: frozenset[str] = _ONLOOKERS) -> EnvSpec | None:
+def _plain_spec(env: VecEnv, wrappers: frozenset[str] = ONLOOKERS) -> EnvSpec | None:
     """The spec of a registered environment that has no other wrappers than these; by default, that only look on."""
     spec: EnvSpec | None = env.get_attr("spec")[0]
     if spec is None or not wrappers.issuperset(wrapper.name for wrapper in spec.additional_wrappers):
@@ -266,7 +268,7 @@ def _source(env: VecEnv, item: EnvLike, episode_length: int) -> EnvSource:
     if isinstance(item, gym.Env):
         return item
     if isinstance(item, (Situation, Mapping, str)):
-        spec = _plain_spec(env, _ONLOOKERS | _FAULTS)
+        spec = _plain_spec(env, ONLOOKERS | _FAULTS)
         if spec is None:
             raise ValueError(
                 "Situations need a registered environment without wrappers; give environments or factories instead, "
@@ -434,6 +436,13 @@ def _get(env: gym.Env[Any, Any], name: str, default: Any) -> Any:
 def env_attribute(env: VecEnv, name: str, default: Any) -> Any:
     """An attribute of the first environment."""
     return env.get_attr(name)[0] if env.has_attr(name) else default
+
+
+def first_env(env: VecEnv) -> gym.Env[Any, Any] | EnvSpec | None:
+    """The first environment, or where that is in another process what it was made of."""
+    here: list[gym.Env[Any, Any]] = getattr(env.unwrapped, "envs", [])
+    spec: EnvSpec | None = None if here else env.get_attr("spec")[0]
+    return here[0] if here else spec
 
 
 def special_dims(

@@ -247,7 +247,7 @@ def test_interrupted_run_goes_on_to_the_same_agent(
     assert_same(agent.dynamics, uninterrupted)
     saved = iteration - 1 if every == 0.0 else {2: 0, 8: 6, 12: 10, 16: 14}[iteration]
     assert steps == list(range(saved + 1, ITERATIONS[-1] + 1))
-    assert not list(tmp_path.glob("*.pt"))  # of no use to a round that is done
+    assert not list(tmp_path.glob("*.progress"))  # of no use to a round that is done
     assert all(file.read_bytes() == content for file, content in files.items())  # nothing is done twice
     assert [data.obs.shape[1] for data in stored(tmp_path, 2)] == [12] * 3
 
@@ -325,10 +325,10 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         ({"horizon": 4}, SITUATIONS, "hyperparameters"),
         ({"seed": 1}, SITUATIONS, "seed"),
-        ({}, SITUATIONS[:2], "situations"),
-        ({"seed": 1}, SITUATIONS[::-1], "seed, situations"),
+        ({}, SITUATIONS[:2], "sources, situations"),
+        ({"seed": 1}, SITUATIONS[::-1], "seed, sources, situations"),
         ({"angle_dims": (0,)}, SITUATIONS, "dimensions"),
-        ({"reward_fn": lambda obs, action, next_obs: next_obs[..., 0]}, SITUATIONS, "needs_reward_fn"),
+        ({"reward_fn": lambda obs, action, next_obs: next_obs[..., 0]}, SITUATIONS, "reward_fn"),
     ],
 )
 def test_folder_of_another_run_is_refused(
@@ -364,3 +364,26 @@ def test_transitions_of_another_kind_are_not_taken_for_those_of_the_folder(
     )
     with pytest.raises(ValueError, match="differs in"):
         make_agent().meta_learn(others, folder=tmp_path)
+
+
+def reward_towards(goal: float) -> Callable[..., torch.Tensor]:
+    return lambda obs, action, next_obs: -(next_obs[..., 0] - goal).abs()
+
+
+def test_folder_knows_what_functions_do(make_agent: Make, tmp_path: Path) -> None:
+    """The names are the same; what is simulated, and what is wanted, is not."""
+    settings: dict[str, Any] = {**ONE_ROUND, "reward_fn": reward_towards(0.5)}
+
+    def situations(angle: float) -> dict[str, Any]:
+        broken = f"joint 0 sensor off by {angle} rad"
+        return {
+            "intact": lambda: gym.make("FamleReacher-v0"),
+            "off": partial(gym.make, "FamleReacher-v0", situation=broken),
+        }
+
+    first = make_agent(**settings).meta_learn(situations(0.1), folder=tmp_path).dynamics
+    for change, angle, differing in (({"reward_fn": reward_towards(0.6)}, 0.1, "reward_fn"), ({}, 0.2, "sources")):
+        with pytest.raises(ValueError, match=rf"differs in: {differing}\."):
+            make_agent(**settings | change).meta_learn(situations(angle), folder=tmp_path)
+    again = make_agent(**settings | {"reward_fn": reward_towards(0.5)}).meta_learn(situations(0.1), folder=tmp_path)
+    assert_same(again.dynamics, first)

@@ -36,7 +36,7 @@ def test_run_of_another_kind_is_refused(tmp_path: Path, change: dict[str, Any], 
     assert (tmp_path / "run.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("content", ["", '{"agent": "FAM', "[]", "3"])
+@pytest.mark.parametrize("content", ["", "[" * 100_000, '{"agent": "FAM', "[]", "3"])
 def test_folder_whose_description_is_damaged_is_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "run.json").write_text(content)
     with pytest.raises(ValueError, match="delete this one"):
@@ -101,3 +101,37 @@ def test_failed_write_leaves_no_description(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.undo()
     RunFolder(tmp_path, FINGERPRINT)
     RunFolder(tmp_path, FINGERPRINT)
+
+
+@pytest.mark.parametrize("name", ["round-0", "round-1.zip", "policy.npz"])
+def test_folder_that_does_not_say_of_which_run_it_is_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).touch()
+    with pytest.raises(ValueError, match=r"holds a run, but no run\.json"):
+        RunFolder(tmp_path, FINGERPRINT)
+    assert [file.name for file in tmp_path.iterdir()] == [name]
+
+
+def test_folder_without_a_run_in_it_is_taken(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").touch()
+    RunFolder(tmp_path, FINGERPRINT)
+
+
+def test_folder_of_an_earlier_version_goes_on(tmp_path: Path) -> None:
+    later = {"environment": "a", "reward_fn": "b", "termination_fn": None, "sources": ["c"]}
+    RunFolder(tmp_path, FINGERPRINT)
+    RunFolder(tmp_path, FINGERPRINT | later)
+    with pytest.raises(ValueError, match=r"differs in: reward_fn\."):
+        RunFolder(tmp_path, FINGERPRINT | later | {"reward_fn": "another"})
+
+
+def test_folder_that_cannot_be_written_is_refused_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    RunFolder(tmp_path, FINGERPRINT)
+    before = (tmp_path / "run.json").read_bytes()
+
+    def fail(*_: Any) -> None:
+        raise PermissionError("Read-only file system")
+
+    monkeypatch.setattr(Path, "write_text", fail)
+    with pytest.raises(PermissionError, match="Read-only"):
+        RunFolder(tmp_path, FINGERPRINT)
+    assert (tmp_path / "run.json").read_bytes() == before
