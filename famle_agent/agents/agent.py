@@ -329,6 +329,7 @@ class ModelBasedAgent(StoredAgent):
         source = envs if isinstance(envs, Transitions) else self.situation_envs(envs)
         check_names(source.situations)
         run = RunFolder(folder, {} if folder is None else self._fingerprint(source))  # which reads all transitions
+        self._close_logger()
         if not self._custom_logger:
             name = tb_log_name or f"{type(self).__name__}_meta"
             self._logger = configure_logger(self.verbose, self.tensorboard_log, name)
@@ -458,6 +459,7 @@ class ModelBasedAgent(StoredAgent):
             self.meta_learn(progress_bar=progress_bar)
         if VecWatch(env).calls != self._calls:  # somebody else has moved the robots since the last learn()
             self._last_obs = None
+        self._close_logger()
         total_timesteps, hooks = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
@@ -496,6 +498,11 @@ class ModelBasedAgent(StoredAgent):
             self._count_episodes(int(dones.sum()), log_interval)
         hooks.on_training_end()
         return self
+
+    def _close_logger(self) -> None:
+        """Ends the logger of the last call, which another takes the place of: TensorBoard's has a thread."""
+        if hasattr(self, "_logger") and not self._custom_logger:
+            self._logger.close()
 
     def _count_episodes(self, ended: int, log_interval: int | None) -> None:
         known, self._episode_num = self._episode_num, self._episode_num + ended

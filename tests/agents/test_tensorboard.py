@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -105,3 +106,13 @@ def test_picture_of_returns(tmp_path: Path) -> None:
     picture = np.asarray(Image.open(tmp_path / "returns.png").convert("RGB"))
     assert picture.shape[0] > 300
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
+
+
+def test_calls_leave_no_thread_behind(quick_agent: FAMLE, tmp_path: Path) -> None:
+    quick_agent.tensorboard_log = str(tmp_path)
+    quick_agent.learn(2)
+    threads = threading.active_count()
+    for _ in range(3):
+        quick_agent.learn(2)
+    assert threading.active_count() == threads
+    assert len(list(tmp_path.rglob("events.*"))) == 4
