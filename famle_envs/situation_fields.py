@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
 from typing import Any, NamedTuple
@@ -28,7 +29,7 @@ def finite(name: str, value: Any) -> float:
         ValueError: It is not finite.
     """
     if not isinstance(value, Real):
-        raise TypeError(f"{name} must be a number, got {value!r}.")
+        raise TypeError(f"{name} must be a number, got {reprlib.repr(value)}.")
     try:
         number = float(value)
     except OverflowError:
@@ -127,5 +128,5 @@ def indices(name: str, values: Sequence[int]) -> tuple[int, ...]:
 
 def _sequence(name: str, values: Any, part: str) -> Sequence[Any]:
     if isinstance(values, (str, bytes, Mapping)) or not hasattr(values, "__iter__"):
-        raise TypeError(f"{name} must be a sequence with one number per {part}, got {values!r}.")
+        raise TypeError(f"{name} must be a sequence with one number per {part}, got {reprlib.repr(values)}.")
     return tuple(values)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import reprlib
 import typing
 import warnings
 from collections.abc import Iterable, Mapping, Set
@@ -301,6 +302,7 @@ _KINDS: tuple[tuple[type, type, str], ...] = (
     (bool, bool, "True or False"),
     (int, Integral, "a whole number"),
     (float, Real, "a number"),
+    (str, str, "text"),
 )
 """Types of settings, what is accepted for them (numpy's numbers too), and what to call that."""
 
@@ -313,11 +315,11 @@ def _check_type(name: str, value: Any) -> None:
     if typing.get_origin(HINTS[name]) is tuple:
         if isinstance(value, str) or not isinstance(value, Iterable):
             numbers = "whole numbers" if int in kinds else "numbers"
-            raise TypeError(f"{name} must be a list of {numbers}, got {value!r}.")
+            raise TypeError(f"{name} must be a list of {numbers}, got {reprlib.repr(value)}.")
         return
     for kind, accepted, what in _KINDS:
         if kind in kinds and (not isinstance(value, accepted) or isinstance(value, bool) != (kind is bool)):
-            raise TypeError(f"{name} must be {what}, got {value!r}.")
+            raise TypeError(f"{name} must be {what}, got {reprlib.repr(value)}.")
 
 
 def _flat(part: Any) -> dict[str, Any]:

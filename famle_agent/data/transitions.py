@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -133,9 +134,10 @@ class Transitions:
             FileNotFoundError: There is no such file.
             ValueError: The file is truncated or holds something else.
         """
+        content = Path(path).read_bytes()
         try:
-            with np.load(path, allow_pickle=False) as archive:
-                check_sizes(archive.zip, os.path.getsize(path))
+            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+                check_sizes(archive.zip, len(content))
                 arrays = {name: archive[name] for name in ("obs", "action", "reward", "next_obs")}
                 situations = tuple(str(name) for name in archive["situations"])
                 ended = archive.get("terminated")

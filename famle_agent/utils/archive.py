@@ -24,7 +24,7 @@ _JSON = 2**24  # bytes of JSON, which takes many times as much memory as text
 
 DAMAGE = (
     *(zipfile.BadZipFile, zlib.error, EOFError, LookupError, SafetensorError, SyntaxError, TokenError),
-    *(ArithmeticError, AttributeError, MemoryError, RuntimeError, TypeError, ValueError),
+    *(ArithmeticError, AttributeError, MemoryError, RuntimeError, SystemError, TypeError, ValueError),
 )
 """What readers of zips, JSON and arrays make of bytes that nobody has written like this."""
 

@@ -115,6 +115,7 @@ def claiming(shape: tuple[int, ...], dtype: str = "<f4", padding: bytes = b"") -
         claiming((-5,)),
         claiming((2**28,), "|u1", bytes(2**28)),
         claiming((1,), "|O"),
+        npz(**GOOD | {"situations": np.array([0xFFFFFFFF, 0x61], "<u4").view("<U1")}),
         b"\x93NUMPY\x01\x00" + (5000).to_bytes(2, "little") + b"(" * 5000,
         b"hello",
         npz(weights=np.ones(3)),
@@ -126,7 +127,7 @@ def claiming(shape: tuple[int, ...], dtype: str = "<f4", padding: bytes = b"") -
         npz(**{**GOOD, "action": np.full((2, 3, 1), np.nan, np.float32)}),
     ],
     ids=[
-        *("36 TiB", "37 GiB", "too many", "negative", "bomb", "objects", "deep header"),
+        *("36 TiB", "37 GiB", "too many", "negative", "bomb", "objects", "no letters", "deep header"),
         *("text", "other arrays", "one array", "pickle", "strings", "one situation", "shape", "NaN"),
     ],
 )

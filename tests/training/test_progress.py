@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -141,3 +143,21 @@ def test_file_of_another_learner_is_refused(tmp_path: Path) -> None:
     learnt("reptile", Progress(tmp_path / "it.progress"))
     with pytest.raises(ValueError, match="of another run"):
         learnt("joint", Progress(tmp_path / "it.progress"))
+
+
+class Planted:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.file,)
+
+
+@pytest.mark.parametrize("write", [lambda value, file: file.write_bytes(pickle.dumps(value)), torch.save])
+def test_code_in_a_file_does_not_run(write: Callable[[object, Path], object], tmp_path: Path) -> None:
+    write(Planted(tmp_path / "ran"), tmp_path / "it.progress")
+    with pytest.raises(ValueError, match="is damaged, or of another run"):
+        learnt("joint", Progress(tmp_path / "it.progress"))
+    assert not (tmp_path / "ran").exists()
