@@ -48,7 +48,7 @@ def load(path: Path) -> pd.DataFrame:
         table = _read(path)
         for name in table.columns.difference(list(_TEXT)):
             table[name] = pd.Series([None if pd.isna(cell) else json.loads(cell) for cell in table[name]])
-    except (ValueError, pd.errors.ParserError) as error:
+    except (RecursionError, ValueError, pd.errors.ParserError) as error:
         raise ValueError(f"{path} is damaged ({error}): restore it from git, or delete its damaged rows.") from error
     return table
 

@@ -150,9 +150,9 @@ def run_batches(batches: Iterable[Batch], table: Path, jobs: int, backend: Backe
         backend: Where they run.
 
     Raises:
-        ReplicateError: A replicate failed; all others have run and are stored.
+        ReplicateError: A replicate failed, and all others have run and are stored; or what was stored is gone.
     """
-    todo = _missing(batches, table)
+    todo = _missing(batches := list(batches), table)
     if not todo:
         return
     failures = list[str]()
@@ -167,6 +167,8 @@ def run_batches(batches: Iterable[Batch], table: Path, jobs: int, backend: Backe
             bar.update()
     if failures:
         raise ReplicateError(f"A replicate failed; the others are stored.\n{failures[0]}")
+    if _missing(batches, table):
+        raise ReplicateError(f"{table} has lost rows while others came: somebody has removed it. Run it again.")
 
 
 def _missing(batches: Iterable[Batch], table: Path) -> list[Batch]:

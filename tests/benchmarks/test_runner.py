@@ -175,3 +175,17 @@ def test_mistakes_end_with_advice(
         assert message in " ".join(error.split())
         assert "Traceback" not in error
     assert list(tmp_path.iterdir()) == []
+
+
+def test_table_that_vanishes_is_told_of(tmp_path: Path) -> None:
+    table = tmp_path / "table.csv"
+
+    def remove() -> list[dict[str, int]]:
+        table.unlink(missing_ok=True)
+        return [{"x": 1}]
+
+    batches = [Batch("method", (0,), lambda: [{"x": 0}]), Batch("method", (1,), remove)]
+    with pytest.raises(ReplicateError, match="lost rows while others came"):
+        run_batches(batches, table, 1)
+    run_batches(batches[:1], table, 1)
+    assert load(table)["x"].tolist() == [0, 1]
