@@ -223,18 +223,25 @@ def simulated_data(task: Task) -> Transitions:
 
     Where FAMLE goes round, its planned transitions come from that very model: its own rounds began with a poor one,
     which the rivals are spared.
+
+    Raises:
+        ValueError: The cache has transitions of other situations, or another number.
     """
     path = task.cache / f"{task.robot}-transitions.npz"
+    agent = FAMLE(task.robot, seed=0, device="cpu")
+    envs, how = agent.situation_envs(), agent.config.simulation
     if not path.exists():
-        agent = FAMLE(task.robot, seed=0, device="cpu")
         transitions = agent.collect(progress_bar=True, n_jobs=-1)
-        if n := agent.config.simulation.planned:
-            envs = agent.situation_envs()
+        if n := how.planned:
             planned = collect(envs.sources, envs.situations, n, agent.planning_policy(), seed=1, n_jobs=-1)
             transitions = transitions.followed_by(planned)
         path.parent.mkdir(parents=True, exist_ok=True)
         transitions.save(path)
-    return Transitions.load(path)
+    stored = Transitions.load(path)
+    expected = tuple(envs.situations), how.transitions_per_situation + how.planned
+    if (stored.situations, stored.obs.shape[1]) != expected:
+        raise ValueError(f"{path} holds other transitions than FAMLE's settings ask for; delete it.")
+    return stored
 
 
 ORIGINAL_CANDIDATES = 64

@@ -15,7 +15,7 @@ from benchmarks import curves, methods
 from benchmarks.ant import ANT_METHODS
 from benchmarks.methods import META_TRAINED, METHODS, ORIGINAL_CANDIDATES, PPO_METHODS, MetaTrained, about
 from benchmarks.reporting.registry import EXPERIMENTS, experiment_named
-from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent
+from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent, Transitions
 from famle_agent.agents import meta_training
 from famle_agent.agents.presets import known_robots
 from famle_agent.training.progress import Progress
@@ -274,3 +274,13 @@ def test_network_may_be_learnt_with_another_planner_than_it_is_used_with(tmp_pat
 
 def test_title_says_what_the_planned_data_of_the_authors_settings_were_planned_with() -> None:
     assert f"planned data with {ORIGINAL_CANDIDATES} sequences" in experiment_named("ant-curves").title
+
+
+def test_simulated_data_of_other_settings_are_refused(tmp_path: Path) -> None:
+    task = task_of(0, tmp_path)
+    data = methods.simulated_data(task)
+    assert methods.simulated_data(task).digest() == data.digest()
+    fewer = {name: getattr(data, name)[:, 1:] for name in ("obs", "action", "reward", "next_obs")}
+    Transitions(**fewer, situations=data.situations).save(tmp_path / "reacher-transitions.npz")
+    with pytest.raises(ValueError, match="holds other transitions"):
+        methods.simulated_data(task)
