@@ -78,7 +78,8 @@ def _env(env: gym.Env[Any, Any], inner: Inner) -> Any:
 
 def _spec(spec: EnvSpec, inner: Inner) -> Any:
     wrappers = [item for item in spec.additional_wrappers if item.name not in ONLOOKERS]
-    return [spec.id, spec.max_episode_steps, inner(spec.kwargs), [[item.name, inner(item.kwargs)] for item in wrappers]]
+    made = spec.id, inner(spec.entry_point), spec.max_episode_steps, inner(spec.kwargs)
+    return [*made, [[item.name, inner(item.kwargs)] for item in wrappers]]
 
 
 def _class(kind: type, _: Inner) -> Any:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -90,6 +91,7 @@ def test_what_is_made_alike_is_alike(name: str) -> None:
         (Situation(motor_gain=(1, 0)), Situation(motor_gain=(0, 1))),
         (torch.nn.Linear(2, 1), torch.nn.Linear(2, 1)),
         (Clock, Slower),
+        (gym.spec("Pendulum-v1"), dataclasses.replace(gym.spec("Pendulum-v1"), entry_point=Clock)),
         (Clock(), Slower()),
         (np.zeros(3), np.zeros(4)),
         (np.zeros(3), np.zeros(3, np.float32)),
