@@ -15,11 +15,10 @@ shipped model.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
-import gymnasium as gym
 import numpy as np
 
 from benchmarks import curves
@@ -37,7 +36,6 @@ from famle_envs import Situation
 from famle_envs.ant import AntEnv
 from famle_envs.wrappers import RandomSituation
 
-ENV_ID = "FamleAnt-v0"
 WALKS = 0.8  # m/s
 BIN = 50  # steps of a stored mean speed
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -115,9 +113,9 @@ def without_embeddings(task: Task) -> FAMLE:
         "transitions_per_situation": n * simulation.transitions(0),
         "round_transitions": n * simulation.transitions(1),
     }
-    agent = FAMLE("ant", seed=0, device="cpu", pretrained=False, compose=False, **budget)
+    agent = FAMLE(task.simulated(), seed=0, device="cpu", pretrained=False, compose=False, **budget)
     path = task.cache / "ant-without-embeddings.zip"
-    mixed = [lambda: RandomSituation(gym.make(ENV_ID))]
+    mixed = [lambda: RandomSituation(task.simulated())]
     return from_cache(agent, path, lambda agent: agent.meta_learn(mixed, folder=path.with_suffix("")))
 
 
@@ -147,9 +145,8 @@ def run(method: str, tasks: Sequence[Task], args: Args) -> list[Result]:
     (task,) = tasks
     agent = model_based(ANT_METHODS[method], task)
     break_at = 300 if args.experiment == "break" else 0
-    env = FAMLEWrapper(gym.make(ENV_ID, max_episode_steps=args.steps), agent)
-    if break_at == 0:
-        env.get_wrapper_attr("set_situation")(task.situation)
+    begins = task if break_at == 0 else replace(task, situation=Situation())
+    env = FAMLEWrapper(begins.make(max_episode_steps=args.steps), agent)
     result = rollout(env, task.seed, task.situation, break_at)
     env.close()
     return [_result(result, task.situation) | about(agent)]

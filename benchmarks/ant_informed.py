@@ -28,7 +28,7 @@ _IDENTIFIES = 300  # steps, after which FAMLE is sure of its embedding
 
 def informed(task: Task) -> FAMLE:
     """FAMLE with one situation, the test robot's."""
-    agent = FAMLE(task.robot, seed=task.seed, device="cpu", pretrained=False, compose=False)
+    agent = FAMLE(task.simulated(), seed=task.seed, device="cpu", pretrained=False, compose=False)
     broken = str(task.situation).replace(" ", "_")
     return from_cache(agent, task.cache / f"{task.robot}-knows-{broken}.zip", partial(_learn_on, task=task))
 
@@ -48,7 +48,7 @@ def _learn_on(agent: FAMLE, task: Task) -> None:
 
 def _as_famle_begins(task: Task) -> tuple[Dynamics, Tensor]:
     """The shipped model, and the embedding that FAMLE takes for the test robot's, (P, 1, embedding_dim)."""
-    agent = shipped(task.robot, task.seed)
+    agent = shipped(task)
     agent.set_env(task.make())
     agent.learn(_IDENTIFIES)
     return agent.model, agent.belief.h[0][:, None]

@@ -92,7 +92,7 @@ def ours(robot: str, steps: int) -> Iterator[Case]:
     kind, strange, profile = OURS[robot]
     trained = [str(situation) for situation in kind.training_situations]
     env_id = Task(robot, 0, Situation(), Path()).env_id
-    settings: dict[str, Any] = {"profile": profile} if profile else {}
+    settings: dict[str, Any] = {"engine": Task.engine} | ({"profile": profile} if profile else {})
 
     def case(fault: str, known: bool = True) -> Case:
         make = partial(gym.make, env_id, situation=fault, max_episode_steps=steps, **settings)

@@ -101,18 +101,25 @@ def from_cache(agent: Agent, path: Path, learn: Callable[[Agent], object] = lamb
 
 
 def famle(task: Task, **overrides: Any) -> FAMLE:
-    """Makes FAMLE with the model that the package ships, or where it ships none a model of the replicate's own."""
-    if is_shipped(task.robot):
-        return shipped(task.robot, task.seed, **overrides)
-    agent = FAMLE(task.robot, seed=task.seed, device=task.device, **overrides)
-    return from_cache(agent, task.cache / f"{task.robot}-ours-{task.seed}.zip")
+    """Makes FAMLE with the model that the package ships, or where it ships none one that is learnt in the cache.
+
+    Learning that is stopped goes on from a folder beside the cached file, if it is asked for again.
+    """
+    if task.is_shipped:
+        return shipped(task, **overrides)
+    agent = FAMLE(task.simulated(), seed=task.meta_seed, device=task.device, pretrained=False, **overrides)
+    path = task.cache / f"{task.robot}-ours-{task.meta_seed}.zip"
+    on_its_way = path.with_suffix("")
+    agent = from_cache(agent, path, lambda agent: agent.meta_learn(folder=on_its_way))
+    shutil.rmtree(on_its_way, ignore_errors=True)
+    return agent
 
 
-def shipped(robot: str, seed: int, **overrides: Any) -> FAMLE:
+def shipped(task: Task, **overrides: Any) -> FAMLE:
     """Makes the agent that the package ships."""
-    agent = FAMLE(robot, seed=seed, device="cpu", **overrides)
+    agent = FAMLE(task.simulated(), seed=task.seed, device="cpu", **overrides)
     if agent.dynamics is None:
-        raise RuntimeError(f"The package ships no model that fits; make it with: famle meta-learn --robot {robot}")
+        raise RuntimeError(f"The package ships no model that fits; make it with: famle meta-learn --robot {task.robot}")
     return agent
 
 
@@ -125,17 +132,17 @@ def oracle(task: Task) -> FAMLE:
     path = task.cache / f"{task.robot}-oracle-{task.profile or task.seed}-{broken}.zip"
     if task.profile:
         # Collected by hand: no agent meta-learns on a profile, and this one is not to be had on a real robot.
-        agent = FAMLE(task.robot, seed=0, device="cpu", pretrained=False, compose=False)
+        agent = FAMLE(task.simulated(), seed=0, device="cpu", pretrained=False, compose=False)
         hold = make_held_uniform(agent.config.simulation.action_hold)
         return from_cache(
             agent,
             path,
             lambda agent: agent.meta_learn(collect([task.make], [task.situation.label], 2000, hold, seed=0)),
         )
-    probe = FAMLE(task.robot, device="cpu", pretrained=False)
+    probe = FAMLE(task.simulated(), device="cpu", pretrained=False)
     situations = len(probe.situation_envs().situations)
     n = situations * probe.config.simulation.transitions_per_situation
-    agent = FAMLE(task.robot, seed=task.seed, device="cpu", pretrained=False, transitions_per_situation=n)
+    agent = FAMLE(task.simulated(), seed=task.seed, device="cpu", pretrained=False, transitions_per_situation=n)
     return from_cache(agent, path, lambda agent: agent.meta_learn([task.situation]))
 
 
@@ -143,7 +150,7 @@ def one_simulator(task: Task) -> FAMLE:
     """Makes an agent that knows only the intact robot in its simulator, four times as long as FAMLE knows each."""
     n = 4 * known_robots()[task.robot].config("ours").simulation.transitions_per_situation
     settings: dict[str, Any] = {"pretrained": False, "transitions_per_situation": n, "compose": False, "adapt_every": 0}
-    agent = FAMLE(task.robot, seed=0, device="cpu", **settings)
+    agent = FAMLE(task.simulated(), seed=0, device="cpu", **settings)
     return from_cache(agent, task.cache / f"{task.robot}-one-simulator.zip", lambda agent: agent.meta_learn(["intact"]))
 
 
@@ -191,7 +198,7 @@ class MetaTrained:
         task, many = tasks[0], self.learn(tasks[0])
         agent = self._new(task)
         model = many.model
-        if not is_shipped(task.robot):
+        if not task.is_shipped:
             model = for_robots(model, [task.seed % self.networks for task in tasks])
         agent.policy.world = WorldModel(model.to(agent.device), many.situations)
         return agent
@@ -201,7 +208,7 @@ class MetaTrained:
 
         Learning that is stopped goes on from a folder beside the cached file, if it is asked for again.
         """
-        members = {} if is_shipped(task.robot) else {"members": self.networks}
+        members = {} if task.is_shipped else {"members": self.networks}
         agent = self._new(replace(task, seed=0, device="cpu"), **self.simulation, **members)
         path = task.cache / f"{task.robot}-{self.name}.zip"
         on_its_way = path.with_suffix("")
@@ -215,7 +222,7 @@ class MetaTrained:
 
     def _new(self, task: Task, **more: Any) -> ModelBasedAgent:
         settings = {**self.settings, **more}
-        return self.cls(task.robot, self.mode, seed=task.seed, device=task.device, pretrained=False, **settings)
+        return self.cls(task.simulated(), self.mode, seed=task.seed, device=task.device, pretrained=False, **settings)
 
 
 def simulated_data(task: Task) -> Transitions:
@@ -228,12 +235,13 @@ def simulated_data(task: Task) -> Transitions:
         ValueError: The cache has transitions of other situations, or another number.
     """
     path = task.cache / f"{task.robot}-transitions.npz"
-    agent = FAMLE(task.robot, seed=0, device="cpu")
+    agent = FAMLE(task.simulated(), seed=0, device="cpu", pretrained=False)
     envs, how = agent.situation_envs(), agent.config.simulation
     if not path.exists():
         transitions = agent.collect(progress_bar=True, n_jobs=-1)
         if n := how.planned:
-            planned = collect(envs.sources, envs.situations, n, agent.planning_policy(), seed=1, n_jobs=-1)
+            planning = famle(replace(task, seed=0)).planning_policy()
+            planned = collect(envs.sources, envs.situations, n, planning, seed=1, n_jobs=-1)
             transitions = transitions.followed_by(planned)
         path.parent.mkdir(parents=True, exist_ok=True)
         transitions.save(path)
@@ -294,8 +302,3 @@ METHODS: dict[str, Method] = {
 
 PPO_METHODS = ("ppo", "ppo-pretrained")
 """Those that need many more steps than the others."""
-
-
-def is_shipped(robot: str) -> bool:
-    """Tells whether the package ships a model of a robot."""
-    return known_robots()[robot].pretrained is not None

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
@@ -52,7 +51,7 @@ def learn_simulated(task: Task) -> Path:
     path = task.cache / f"{task.robot}-ppo.zip"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
-        env = make_vec_env(lambda: RandomSituation(gym.make(task.env_id)), n_envs=8, seed=0)
+        env = make_vec_env(lambda: RandomSituation(task.simulated()), n_envs=8, seed=0)
         agent = PPO("MlpPolicy", env, seed=0, device="cpu", **SIMULATED_SETTINGS)
         agent.learn(SIMULATED_STEPS[task.robot], progress_bar=True)
         with whole_file(path) as partial, partial.open("wb") as file:

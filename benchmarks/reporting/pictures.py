@@ -65,6 +65,26 @@ def draw_paths(study: Study) -> Figure:
     return figure
 
 
+def draw_scores(tables: Mapping[str, tuple[pd.DataFrame, str]]) -> Figure:
+    """Draws what each replicate gets, a panel a table.
+
+    Args:
+        tables: By title, a table with a row a replicate and a column a method, and what its figures are.
+    """
+    figure, panels = _panels(len(tables), min(2, len(tables)), (5.0, 1.9))
+    for axes, (title, (scores, label)) in zip(panels, tables.items(), strict=True):
+        names = {method: style_of(str(method)).label for method in scores}
+        palette = {name: style_of(str(method)).colour for method, name in names.items()}
+        data = scores.rename(columns=names).melt(var_name="method", value_name="score")
+        shared: dict[str, Any] = {"data": data, "x": "score", "y": "method", "hue": "method", "palette": palette}
+        sns.stripplot(**shared, jitter=False, size=5, alpha=0.3, legend=False, ax=axes)
+        sns.pointplot(
+            **shared, estimator=_mean, errorbar=_bounds, markers="|", markersize=12, linestyle="none", ax=axes
+        )
+        style(axes, label, "", title)
+    return figure
+
+
 # --- learning curves --------------------------------------------------------------------------------------------------
 
 

@@ -87,6 +87,34 @@ def probability_of_improvement(x: Any, y: Any, paired: bool = False) -> Estimate
     return p, *_bootstrap(groups, wins, paired=paired)
 
 
+def gap_closed(scores: Any, frozen: Any, oracle: Any) -> Estimate:
+    """Computes which part of the way from agents that do not adapt to an oracle a group goes, and its interval.
+
+    It is (scores - frozen) / (oracle - frozen) of interquartile means; replicates are resampled together.
+
+    Args:
+        scores: A figure of each replicate of a group, (n,).
+        frozen: The same figure of the same replicates without adaptation, (n,).
+        oracle: The same figure of the oracle, (n,).
+
+    Raises:
+        ValueError: There is no replicate.
+    """
+    ours, low, high = (np.asarray(group, dtype=np.float64) for group in (scores, frozen, oracle))
+    if not len(ours):
+        raise ValueError("A gap needs a replicate that all three groups have.")
+    part = float(_part_of_gap(ours, low, high))
+    if len(ours) < FEWEST or not np.isfinite(part):
+        return part, np.nan, np.nan
+    return part, *_bootstrap((ours, low, high), _part_of_gap, paired=True)
+
+
+def _part_of_gap(scores: Array, frozen: Array, oracle: Array, axis: int = -1) -> Any:
+    ours, low, high = (stats.trim_mean(group, 0.25, axis=axis) for group in (scores, frozen, oracle))
+    with np.errstate(divide="ignore", invalid="ignore"):  # no gap
+        return (ours - low) / (high - low)
+
+
 def _bootstrap(groups: tuple[Array, ...], statistic: Any, paired: bool = False) -> tuple[float, float]:
     interval = stats.bootstrap(
         groups, statistic, paired=paired, n_resamples=_RESAMPLES, method="percentile", rng=np.random.default_rng(0)

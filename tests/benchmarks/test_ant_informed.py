@@ -40,7 +40,7 @@ def collected(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 def test_informed_ant_knows_the_test_robot_alone(collected: list[Any], tmp_path: Path) -> None:
     agent = ant_informed.informed(Task("ant", 0, BROKEN, tmp_path))
-    model, before = agent.model, shipped("ant", 0).model
+    model, before = agent.model, shipped(Task("ant", 0, BROKEN, tmp_path)).model
     assert agent.situations == (BROKEN.label,)
     assert model.n_situations == 1
     assert collected == [(BROKEN, 20), (BROKEN, 10)]

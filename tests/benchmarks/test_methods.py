@@ -15,6 +15,7 @@ from benchmarks import curves, methods
 from benchmarks.ant import ANT_METHODS
 from benchmarks.methods import META_TRAINED, METHODS, ORIGINAL_CANDIDATES, PPO_METHODS, MetaTrained, about
 from benchmarks.reporting.registry import EXPERIMENTS, experiment_named
+from benchmarks.task import Task
 from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent, Transitions
 from famle_agent.agents import meta_training
 from famle_agent.agents.presets import known_robots
@@ -160,7 +161,7 @@ def test_cached_model_outlasts_all_settings_but_those_of_its_learning(
 
 def test_model_that_is_not_shipped_is_named() -> None:
     with pytest.raises(RuntimeError, match="famle meta-learn --robot reacher"):
-        methods.shipped("reacher", seed=0)
+        methods.shipped(task_of(0, Path("unused")))
 
 
 # --- networks side by side --------------------------------------------------------------------------------
@@ -231,7 +232,7 @@ def test_stopped_meta_training_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path
 
 
 def test_replicates_share_one_network_where_one_is_shipped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(methods, "is_shipped", lambda robot: True)
+    monkeypatch.setattr(Task, "is_shipped", True)
     recipe = MetaTrained("alone", AMPC)
     one, other = (recipe.agent(task_of(seed, tmp_path)) for seed in (0, 1))
     assert one.model.members == 1
