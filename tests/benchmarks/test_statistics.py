@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from benchmarks.reporting.statistics import (
     first_crossing,
+    gap_closed,
     interquartile_mean,
     p_value,
     probability_of_improvement,
@@ -30,6 +31,25 @@ def test_either_group_is_better_or_they_tie(x: list[float], y: list[float]) -> N
 @given(samples)
 def test_group_is_no_better_than_itself(x: list[float]) -> None:
     assert probability_of_improvement(x, x)[0] == pytest.approx(0.5)
+
+
+@given(samples, st.floats(-3.0, 3.0), st.floats(0.1, 9.0))
+def test_part_of_a_gap_has_no_unit(frozen: list[float], part: float, gap: float) -> None:
+    oracle, ours = ([value + share * gap for value in frozen] for share in (1.0, part))
+    assert gap_closed(ours, frozen, oracle)[0] == pytest.approx(part, abs=1e-6)
+    ours, frozen, oracle = ([-5.0 * value for value in group] for group in (ours, frozen, oracle))
+    found, low, high = gap_closed(ours, frozen, oracle)
+    assert found == pytest.approx(part, abs=1e-6)
+    assert np.isnan(low) == (len(frozen) < 5)
+    assert np.isnan(low) or low <= found + 1e-6 <= high + 2e-6
+
+
+def test_without_a_gap_no_part_of_it_is_closed() -> None:
+    part, low, high = gap_closed([1.0] * 6, [2.0] * 6, [2.0] * 6)
+    assert not np.isfinite(part)
+    assert np.isnan([low, high]).all()
+    with pytest.raises(ValueError, match="all three groups"):
+        gap_closed([], [], [])
 
 
 def test_interval_of_improvement_narrows_with_more_replicates() -> None:
