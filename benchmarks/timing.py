@@ -2,6 +2,7 @@
 
 python -m benchmarks.timing                                # all parts, on the arm and the ant
 python -m benchmarks.timing --robots ant --parts control   # a whole control step of FAMLE, in an episode
+python -m benchmarks.timing --robots reacher ant quadruped minitaur --parts engines   # PyBullet beside MuJoCo
 
 Whatever is compared takes turns in one run, so that a slow moment of the machine meets all of it. In "step in turns"
 networks are hardly trained, since a step costs the same whatever they know; `famle-original` is measured inside an
@@ -14,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -36,6 +38,7 @@ from famle_agent.agents.presets import known_robots
 from famle_agent.planning import RandomShooting
 from famle_agent.rollout import rollout
 from famle_envs import Situation
+from famle_envs.engines import ENGINES
 
 HARDLY_TRAINED: Mapping[str, Any] = {
     "rounds": 0,
@@ -49,7 +52,12 @@ HARDLY_TRAINED: Mapping[str, Any] = {
 HARDLY: Mapping[str, Any] = {**HARDLY_TRAINED, "joint_iterations": 1, "meta_iterations": 1}
 """The same for those that learn in simulation."""
 
-BREAKS: Mapping[str, str] = {"reacher": "paper", "ant": "joint 2 dead, yaw sensor off by 60 deg"}
+BREAKS: Mapping[str, str] = {
+    "reacher": "paper",
+    "ant": "joint 2 dead, yaw sensor off by 60 deg",
+    "quadruped": "front left leg blocked",
+    "minitaur": "intact",
+}
 """What happens to each robot in an episode."""
 
 
@@ -59,8 +67,8 @@ class Args:
 
     robots: tuple[str, ...] = ("reacher", "ant")
     """Robots with all modes."""
-    parts: tuple[str, ...] = ("step in turns", "environment", "planning", "control")
-    """What is timed."""
+    parts: tuple[str, ...] = ("step in turns", "environment", "planning", "control", "engines")
+    """What is timed; all but "engines" in PyBullet."""
     turns: int = 5
     """Turns of each method; the median counts."""
     turn_steps: int = 50
@@ -113,10 +121,25 @@ def environment(robot: str, args: Args) -> dict[str, float]:
     return {"environment step (ms)": step, "bare stepSimulation (ms)": raw, "ratio": step / raw}
 
 
+def engines(robot: str, args: Args) -> dict[str, float]:
+    """Times a step of the environment in each engine, and a second of its own time; of the processor alone."""
+    envs = [_make(robot, engine=engine) for engine in ENGINES]
+    action = np.full(envs[0].action_space.shape or (), 0.3)
+    # The clock leaves out what other processes take of the long steps of gaits.
+    steps = _medians(args.repeats, *(partial(env.unwrapped.step, action) for env in envs), clock=time.process_time)
+    period = envs[0].get_wrapper_attr("control_period")
+    for env in envs:
+        env.close()
+    figures = dict[str, float]()
+    for engine, step in zip(ENGINES, steps, strict=True):
+        figures |= {f"{engine}: step (ms)": step, f"{engine}: simulated second (ms)": step / period}
+    return figures
+
+
 def planning(robot: str, args: Args) -> dict[str, float]:
     """Times our plan, and the paper's against the bare matrix products of the same shapes."""
     task = Task(robot, 0, Situation(), args.cache)
-    ours, paper = famle(task), FAMLE(robot, "paper", **HARDLY).meta_learn()
+    ours, paper = famle(task), FAMLE(task.simulated(), "paper", **HARDLY).meta_learn()
     planner, model, obs = paper.config.planner, paper.model, _make(robot).reset(seed=0)[0]
     sizes = [model.n_features + model.action_dim, *paper.config.model.hidden, model.obs_dim]
     x = [torch.randn(planner.candidates, size) for size in sizes[:-1]]
@@ -159,6 +182,7 @@ PARTS: Mapping[str, Callable[[str, Args], Mapping[str, Any]]] = {
     "environment": environment,
     "planning": planning,
     "control": control,
+    "engines": engines,
 }
 """What can be timed."""
 
@@ -176,33 +200,34 @@ def main(args: Args) -> None:
             print(f"\n{robot}, {part}, {args.threads} thread(s), medians:", medians.to_string(), sep="\n")
 
 
-def _medians(repeats: int, *calls: Callable[[], object]) -> list[float]:
+def _medians(repeats: int, *calls: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> list[float]:
     """Returns the median milliseconds of calls that take turns; the first two turns only warm up."""
     seconds = np.zeros((repeats + 2, len(calls)))
     for turn in range(len(seconds)):
         for i, call in enumerate(calls):
-            start = time.perf_counter()
+            start = clock()
             call()
-            seconds[turn, i] = time.perf_counter() - start
+            seconds[turn, i] = clock() - start
     return [float(median) for median in 1e3 * np.median(seconds[2:], axis=0)]
 
 
-def _make(robot: str, **kwargs: Any) -> gym.Env[Any, Any]:
-    env = gym.make(known_robots()[robot].env_id, **kwargs)
+def _make(robot: str, engine: str = Task.engine, **kwargs: Any) -> gym.Env[Any, Any]:
+    env = gym.make(known_robots()[robot].env_id, engine=engine, **kwargs)
     env.reset(seed=0)
     return env
 
 
 def _hardly_trained(robot: str) -> dict[str, BaseAlgorithm]:
+    task = Task(robot, 0, Situation(), Path())
     agents: dict[str, BaseAlgorithm] = {
-        "famle": FAMLE(robot, **HARDLY),
-        "famle-paper": FAMLE(robot, "paper", **HARDLY),
-        "famle-original": FAMLE(robot, "original", **HARDLY),
-        "ampc": AMPC(robot, **HARDLY_TRAINED),
-        "ampc-reptile": AMPCMAML(robot, **HARDLY),
-        "ampc-fomaml": AMPCMAML(robot, meta_learner="first-order-maml", **HARDLY),
-        "ampc-maml": AMPCMAML(robot, meta_learner="maml", **HARDLY),
-        "ppo": from_scratch(Task(robot, 0, Situation(), Path())),
+        "famle": FAMLE(task.simulated(), **HARDLY),
+        "famle-paper": FAMLE(task.simulated(), "paper", **HARDLY),
+        "famle-original": FAMLE(task.simulated(), "original", **HARDLY),
+        "ampc": AMPC(task.simulated(), **HARDLY_TRAINED),
+        "ampc-reptile": AMPCMAML(task.simulated(), **HARDLY),
+        "ampc-fomaml": AMPCMAML(task.simulated(), meta_learner="first-order-maml", **HARDLY),
+        "ampc-maml": AMPCMAML(task.simulated(), meta_learner="maml", **HARDLY),
+        "ppo": from_scratch(task),
     }
     for agent in agents.values():
         if isinstance(agent, ModelBasedAgent):
