@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
+from contextlib import suppress
+from importlib import import_module
 from typing import Any
 
 import mujoco
@@ -64,6 +66,10 @@ class Pictures:
 
 def _gl_context() -> Any:
     """MuJoCo's own choice, which is a window of the screen; EGL where there is none."""
+    # Torch for CUDA imports Triton when it first optimises. Triton and OpenGL without a graphics card both bring an
+    # LLVM, and the process crashes where OpenGL's is the first.
+    with suppress(ImportError):
+        import_module("triton")
     on_a_screen = {"DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"} & set(os.environ)
     if sys.platform == "linux" and not on_a_screen:
         from mujoco.egl import GLContext

@@ -5,12 +5,14 @@ from __future__ import annotations
 import copy
 import gc
 import math
+import os
 import pickle
 import subprocess
 import sys
 import warnings
 import weakref
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -128,6 +130,17 @@ def test_missing_pybullet_is_refused_with_the_remedy() -> None:
     assert "DependencyNotInstalled" in done.stderr
     assert 'pip install "famle[pybullet]"' in done.stderr
     assert "compiler" in done.stderr
+
+
+def test_opengl_does_not_load_its_llvm_before_that_of_triton(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not draws("mujoco"):
+        pytest.skip("MuJoCo cannot render here.")
+    stub = "import sys\nprint([name for name in ('mujoco.egl', 'mujoco.osmesa', 'OpenGL') if name in sys.modules])"
+    (tmp_path / "triton.py").write_text(stub)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    robot = "gym.make('FamleReacher-v0', engine='mujoco', render_mode='rgb_array')"
+    done = run(f"import gymnasium as gym, famle_envs\nenv = {robot}\nenv.reset()\nprint(env.render().shape)")
+    assert done.stdout.split("\n")[:2] == ["[]", "(480, 480, 3)"], done.stderr
 
 
 def test_spec_and_copies_keep_the_engine(make_env: MakeEnv, env_id: str, engine: str) -> None:
