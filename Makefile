@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: install demo demo-ant test test-fast lint format clean
+.PHONY: install demo demo-ant test test-fast lint docs format clean
 
 install: $(STAMP)
 
@@ -18,7 +18,7 @@ demo: install  ## Meta-learn an arm, break it, and watch it adapt: a few minutes
 demo-ant: install  ## Break an ant in mid-run: a minute or two, results in demo-ant/
 	$(BIN)/famle demo --robot ant --out demo-ant
 
-test: lint  ## All that a change must pass
+test: lint docs  ## All that a change must pass
 	$(BIN)/pytest --numprocesses 2 --cov --cov-report term-missing:skip-covered --cov-fail-under 90
 
 test-fast: install  ## Without the slow tests
@@ -30,9 +30,12 @@ lint: install
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+docs: install  ## The manual with its reference, in site/; a warning is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
 format: install
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) demo demo-ant runs build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo demo-ant runs build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

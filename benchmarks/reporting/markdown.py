@@ -265,6 +265,31 @@ def headline(figures: Mapping[str, pd.DataFrame]) -> str:
     return _table(["method", *(title for _, title, _ in columns)], lines) + f"\n\nReplicates: {', '.join(counts)}."
 
 
+_SHORT: Sequence[tuple[str, str, str, Callable[[Row], str]]] = (
+    ("reacher-paper", "arm, two faults", "return of the first 50 steps", partial(_median, key="first_episode")),
+    ("ant-unseen", "ant, a dead joint and a wrong compass", "return of the first 1,000 steps", partial(_median, key="return")),
+    ("quadruped-leg", "quadruped, a leg blocked", "reaches its goal, gaits", _success),
+    ("quadruped-both", "quadruped, a leg blocked and a wrong compass", "reaches its goal, gaits", _success),
+    ("minitaur-held-out", "Minitaur, nothing broken", "metres in 60 gaits", partial(_median, key="distance")),
+)
+"""The experiment, what is broken, what is measured and the cell of each row of the table for a first look."""
+
+
+def in_short(figures: Mapping[str, pd.DataFrame]) -> str:
+    """Writes the table for a first look: a row a robot and what is broken; with adaptation, without, and the oracle.
+
+    Args:
+        figures: A row a method, by the name of the experiment.
+    """
+    lines = []
+    for name, broken, measured, cell in _SHORT:
+        if name in figures:
+            rows = dict(zip(figures[name].index, _rows(figures[name]), strict=True))
+            cells = (cell(rows[method]) if method in rows else "" for method in ("famle", "famle-frozen", "oracle"))
+            lines.append([broken, measured, *cells, str(rows["famle"]["replicates"]) if "famle" in rows else ""])
+    return _table(("robot", "measured", "FAMLE", "the same without adaptation", "oracle", "runs"), lines)
+
+
 def sine_section(title: str, stored: pd.DataFrame) -> str:
     """Writes the section of the paper's figure 2, which has no robot.
 

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markdown import Markdown
 
 from benchmarks.reporting.figures import figures
-from benchmarks.reporting.markdown import document, headline, section, sine_section
+from benchmarks.reporting.markdown import document, headline, in_short, section, sine_section
 from benchmarks.reporting.pictures import draw, draw_paths, draw_times
 from benchmarks.reporting.registry import EXPERIMENTS, experiment_named
 from benchmarks.reporting.study import Study, read_study
@@ -63,7 +63,7 @@ class Report:
         return all((self.results / name).exists() for name in ("sine.csv", "sine.png"))
 
     def _text(self, studies: list[Study], tables: Mapping[str, pd.DataFrame], times: bool) -> str:
-        sections = [f"## All robots\n\n{headline(tables)}"]
+        sections = [f"## In short\n\n{in_short(tables)}", f"## All robots\n\n{headline(tables)}"]
         drawn = set[str]()
         for study in studies:
             name, picture = study.experiment.name, study.experiment.picture_name

@@ -27,7 +27,17 @@ from famle_agent.training.policy_search import PolicySearch
 from famle_agent.training.reptile import Reptile
 from famle_agent.training.trainer import MetaTrainer
 
-__all__ = ["AT_LEAST_ONE", "CHOICES", "HINTS", "ONLINE", "SAFETY", "SEEN_IN_DIMS", "keywords_of", "parts_of"]
+__all__ = [
+    "AT_LEAST_ONE",
+    "CHOICES",
+    "HINTS",
+    "ONLINE",
+    "SAFETY",
+    "SEEN_IN_DIMS",
+    "described_by",
+    "keywords_of",
+    "parts_of",
+]
 
 
 def parts_of(values: Mapping[str, Any], chosen: Set[str]) -> dict[str, Any]:
@@ -69,6 +79,15 @@ def keywords_of(config: Any) -> dict[str, Any]:
     elif config.training.meta_learner is not None:
         found["meta_learner"] = "reptile"
     return {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
+
+
+def described_by() -> dict[str, list[tuple[type, str]]]:
+    """Returns the parts and their fields that each keyword sets, whose docstrings say what it means."""
+    found: dict[str, list[tuple[type, str]]] = {keyword: [] for keyword in HINTS}
+    for part, names in _NAMES.items():
+        for name, keyword in names.items():
+            found[keyword].append((part, name))
+    return found
 
 
 class _Reader:

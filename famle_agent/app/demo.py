@@ -59,7 +59,8 @@ def run_demo(
     Args:
         robot: The robot's name. Its shipped model is used, or one is meta-learned where none is shipped.
         situation: What breaks: a preset or a description; empty takes the robot's own.
-        out: Folder for the agent, the picture, the film and TensorBoard.
+        out: Folder for the agent, the picture, the film and TensorBoard. Where it holds something already, the next
+            free name is taken: ``demo-2``, ``demo-3`` and so on.
         seed: Seed of everything.
         **overrides: Fields of the robot's :class:`Demo`, or settings of the agent.
 
@@ -75,32 +76,42 @@ def run_demo(
     try:
         # A wrong name or path, or a machine that cannot render, should fail before minutes of learning.
         env.unwrapped.set_situation(situation)  # type: ignore[attr-defined]
+        out = _free_folder(out)
         check_writable(out / "agent.zip")
         env.reset(seed=seed)
         env.render()
         broken = str(env.get_wrapper_attr("situation"))
-        console.print(Text(f"The {robot} breaks {_when(shown)}: {broken}."))
+        _say(console, f"The {robot} breaks {_when(shown)}: {broken}.")
         agents = _with_and_without_adaptation(robot, seed, out, settings, console)
         runs: dict[str, list[Rollout]] = {}
         for name, agent in agents.items():
-            console.print(Text(f"Running {name}."))
+            _say(console, f"Running {name}.")
             log = out / "tensorboard" / name.replace(" ", "_")
             runs[name] = _run(agent, env, situation, shown, seed, log, console)
         console.print(_table(runs, robot, broken))
         shown.picture(runs, env, out)
         films = {name: [frame for run in episodes for frame in run.frames] for name, episodes in runs.items()}
-        (out / "robot.gif").write_bytes(encode_gif(side_by_side(films), _film_rate(env)))
+        texts = {name: _captions(episodes, env, broken) for name, episodes in runs.items()}
+        (out / "robot.gif").write_bytes(encode_gif(side_by_side(films, texts), _film_rate(env)))
     finally:
         env.close()
     written = ", ".join(sorted(path.name for path in out.iterdir() if path.is_file()))
-    console.print(
-        f"Written to {out}/: {written}; see also tensorboard --logdir {out}/tensorboard",
-        markup=False,
-        emoji=False,
-        highlight=False,
-        soft_wrap=True,
-    )
+    _say(console, f"Written to {out}/: {written}; see also tensorboard --logdir {out}/tensorboard")
     return runs
+
+
+def _say(console: Console, text: str) -> None:
+    """Prints one line as it is, so that a line of a redirected output is a line too."""
+    console.print(Text(text), soft_wrap=True)
+
+
+def _free_folder(wanted: Path) -> Path:
+    """Returns the folder if it is new or empty, else the first free one of ``wanted-2``, ``wanted-3``, ..."""
+    folder, number = wanted, 1
+    while folder.is_dir() and any(folder.iterdir()):
+        number += 1
+        folder = wanted.with_name(f"{wanted.name}-{number}")
+    return folder
 
 
 def _demo_of(robot: str, overrides: Mapping[str, Any]) -> tuple[Demo, dict[str, Any]]:
@@ -122,10 +133,10 @@ def _with_and_without_adaptation(
 ) -> dict[str, FAMLE]:
     agent = FAMLE(robot, seed=seed, tensorboard_log=str(out / "tensorboard"), **settings)
     if agent.dynamics is None:
-        console.print(f"[bold]FAMLE on {robot}[/bold]: meta-learning in simulation.")
+        _say(console, f"FAMLE on {robot}: meta-learning in simulation.")
         start = time.perf_counter()
         agent.meta_learn(progress_bar=True, n_jobs=-1)
-        console.print(f"Meta-learned {len(agent.situations)} situations in {time.perf_counter() - start:.0f} s.")
+        _say(console, f"Meta-learned {len(agent.situations)} situations in {time.perf_counter() - start:.0f} s.")
     out.mkdir(parents=True, exist_ok=True)
     agent.save(out / "agent.zip")
     return {"with adaptation": agent, "without adaptation": FAMLE.load(out / "agent.zip", adapt_every=0)}
@@ -149,14 +160,13 @@ def _run(
     agent.set_random_seed(seed)
     env.unwrapped.set_situation(None)  # type: ignore[attr-defined]
     wrapped, logger, runs, done = FAMLEWrapper(env, agent), configure(str(log), ["tensorboard"]), list[Rollout](), 0
-    film_every = max(1, round(1.0 / (env.get_wrapper_attr("control_period") * _FILM_FPS)))
     for episode in range(shown.episodes):
         breaks_at = shown.breaks_at[1] if episode == shown.breaks_at[0] else None
-        filmed = film_every if episode in (0, shown.breaks_at[0], shown.episodes - 1) else 0
+        filmed = _film_every(env) if episode in (0, shown.breaks_at[0], shown.episodes - 1) else 0
         on_step = _step_logger(logger, wrapped, done, console)
         runs.append(rollout(wrapped, seed if episode == 0 else None, situation, breaks_at, filmed, on_step))
         done += runs[-1].steps
-        console.print(Text(f"  episode {episode}: {_outcome(runs[-1])}. {_belief_and_truth(wrapped)}"))
+        _say(console, f"  episode {episode}: {_outcome(runs[-1])}. {_belief_and_truth(wrapped)}")
         logger.record("episode/return", runs[-1].total)
         logger.dump(done)
     log_gif(logger, "robot/last_episode", runs[-1].frames, _film_rate(env), done)
@@ -171,13 +181,30 @@ def _step_logger(logger: Logger, env: FAMLEWrapper, first: int, console: Console
         log_adaptations(logger, env.agent.belief)
         logger.dump(first + step)
         if (step + 1) % _STEPS_BETWEEN_LINES == 0:
-            console.print(Text(f"  step {step + 1}. {_belief_and_truth(env)}"))
+            _say(console, f"  step {step + 1}. {_belief_and_truth(env)}")
 
     return on_step
 
 
 def _belief_and_truth(env: FAMLEWrapper) -> str:
     return f"Belief: {env.agent.diagnose()} Truth: {env.get_wrapper_attr('situation')}."
+
+
+def _film_every(env: gym.Env[Any, Any]) -> int:
+    """Steps from picture to picture of the film."""
+    return max(1, round(1.0 / (env.get_wrapper_attr("control_period") * _FILM_FPS)))
+
+
+def _captions(runs: Sequence[Rollout], env: gym.Env[Any, Any], broken: str) -> list[str]:
+    """Writes below each picture what is wrong with the robot, what the agent believes, and the return until then."""
+    every, texts, truth = _film_every(env), list[str](), "intact"
+    for run in runs:
+        so_far = run.reward.cumsum()
+        for step in range(0, every * len(run.frames), every):
+            truth = broken if run.breaks_at is not None and step >= run.breaks_at else truth
+            texts.append(f"truth: {truth}\nbelief: {run.situations[step]}\nreturn: {so_far[step]:.0f}")
+        truth = truth if run.breaks_at is None else broken
+    return texts
 
 
 def _film_rate(env: gym.Env[Any, Any]) -> float:

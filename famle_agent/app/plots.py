@@ -17,6 +17,12 @@ from famle_agent.rollout import Frames, running_mean
 
 __all__ = ["plot_paths", "plot_returns", "plot_speed", "side_by_side", "style"]
 
+_TITLE = 24
+"""Pixels of the title above a film."""
+
+_CAPTION = 54
+"""Pixels of the three lines below a film."""
+
 
 def style(axes: Axes, xlabel: str, ylabel: str, title: str = "") -> None:
     """What all our pictures share."""
@@ -103,14 +109,26 @@ def plot_paths(
     figure.savefig(path, dpi=150)
 
 
-def side_by_side(films: Mapping[str, Frames], size: int = 320) -> list[npt.NDArray[np.uint8]]:
-    """The films next to each other under their titles; the shorter ones stop at their last picture."""
+def side_by_side(
+    films: Mapping[str, Frames], captions: Mapping[str, Sequence[str]] | None = None, size: int = 320
+) -> list[npt.NDArray[np.uint8]]:
+    """Puts films next to each other under their titles; the shorter ones stop at their last picture.
+
+    Args:
+        films: Pictures (height, width, 3) by title.
+        captions: Up to three lines below each picture, by title; None writes none.
+        size: Pixels of the side of a picture.
+    """
     frames = []
+    below = 0 if captions is None else _CAPTION
     for i in range(max(len(film) for film in films.values())):
-        sheet = Image.new("RGB", (size * len(films), size + 24), "white")
+        sheet = Image.new("RGB", (size * len(films), size + _TITLE + below), "white")
+        draw = ImageDraw.Draw(sheet)
         for column, (title, film) in enumerate(films.items()):
-            picture = Image.fromarray(film[min(i, len(film) - 1)]).resize((size, size))
-            sheet.paste(picture, (size * column, 24))
-            ImageDraw.Draw(sheet).text((size * column + 8, 6), title, fill="black")
+            shown, left = min(i, len(film) - 1), size * column
+            sheet.paste(Image.fromarray(film[shown]).resize((size, size)), (left, _TITLE))
+            draw.text((left + 8, 6), title, fill="black")
+            if captions is not None:
+                draw.multiline_text((left + 8, _TITLE + size + 4), captions[title][shown], fill="black")
         frames.append(np.asarray(sheet))
     return frames

@@ -62,9 +62,12 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
     box: Any = action_space
     if not box.is_bounded("both"):
         raise ValueError(
-            f"The action space must be bounded, got {box}. Say which actions are sensible, here those from -1 to 1: "
+            f"The action space must be bounded, got {box}. Say which actions are sensible, here those from -1 to 1, or "
+            "2 beyond the only bound: "
             "gymnasium.wrappers.TransformAction(env, lambda a: a, gymnasium.spaces.Box("
-            "np.maximum(env.action_space.low, -1.0), np.minimum(env.action_space.high, 1.0)))."
+            "np.where(env.action_space.bounded_below, env.action_space.low, np.fmin(env.action_space.high, 1) - 2), "
+            "np.where(env.action_space.bounded_above, env.action_space.high, np.fmax(env.action_space.low, -1) + 2), "
+            "dtype=env.action_space.dtype))."
         )
 
 

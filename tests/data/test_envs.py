@@ -374,7 +374,10 @@ def test_spaces_that_no_model_predicts_are_refused(
     "action_space",
     [
         spaces.Box(-np.inf, np.inf, (2,)),
+        spaces.Box(-np.inf, np.inf, (2,), np.float64),
         spaces.Box(np.float32([-1, 0]), np.float32([1, np.inf])),
+        spaces.Box(np.float32([5, -np.inf]), np.float32([np.inf, -5])),
+        spaces.Box(np.float32([-3, 5]), np.float32([np.inf, 9])),
         spaces.Discrete(3),
         spaces.Discrete(3, start=4),
     ],
