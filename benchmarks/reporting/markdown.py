@@ -267,7 +267,12 @@ def headline(figures: Mapping[str, pd.DataFrame]) -> str:
 
 _SHORT: Sequence[tuple[str, str, str, Callable[[Row], str]]] = (
     ("reacher-paper", "arm, two faults", "return of the first 50 steps", partial(_median, key="first_episode")),
-    ("ant-unseen", "ant, a dead joint and a wrong compass", "return of the first 1,000 steps", partial(_median, key="return")),
+    (
+        "ant-unseen",
+        "ant, a dead joint and a wrong compass",
+        "return of the first 1,000 steps",
+        partial(_median, key="return"),
+    ),
     ("quadruped-leg", "quadruped, a leg blocked", "reaches its goal, gaits", _success),
     ("quadruped-both", "quadruped, a leg blocked and a wrong compass", "reaches its goal, gaits", _success),
     ("minitaur-held-out", "Minitaur, nothing broken", "metres in 60 gaits", partial(_median, key="distance")),

@@ -16,7 +16,7 @@ from rich.console import Console
 from famle_agent import __version__
 from famle_agent.utils.errors import NotLearnedError
 
-__all__ = ["main"]
+__all__ = ["main", "read_command"]
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Demo:
     episodes: int = 5
     """Episodes after the break, of the arm."""
     out: Path = Path("demo")
-    """Folder for the results."""
+    """Folder for the results; where it holds something already, the next free one of demo-2, demo-3 and so on."""
     seed: int = 0
     """Seed of everything."""
     meta_iterations: int | None = None
@@ -140,13 +140,19 @@ def main(args: list[str] | None = None) -> None:
         sys.exit(2)
 
 
+def read_command(args: list[str]) -> Demo | MetaLearn | Run:
+    """Reads a command line without its program's name; one that is wrong ends the process with advice."""
+    command: Demo | MetaLearn | Run = tyro.extras.subcommand_cli_from_dict(
+        {"demo": Demo, "meta-learn": MetaLearn, "run": Run}, args=args, prog="famle"
+    )
+    return command
+
+
 def _run(args: list[str]) -> None:
     if args == ["--version"]:
         _say(f"famle {__version__}")
         return
-    command = tyro.extras.subcommand_cli_from_dict(
-        {"demo": Demo, "meta-learn": MetaLearn, "run": Run}, args=args, prog="famle"
-    )
+    command = read_command(args)
     import torch
 
     if not isinstance(command, MetaLearn):

@@ -14,6 +14,8 @@ from famle_agent import FAMLE
 from famle_agent.app import demo
 from famle_agent.app.cli import main
 from famle_agent.app.demo import run_demo
+from famle_agent.app.plots import side_by_side
+from famle_agent.rollout import Rollout
 from tests.conftest import QUICK
 
 slow = pytest.mark.slow
@@ -65,6 +67,57 @@ def test_demo_says_in_words_what_broke_and_how_far_it_is(
         lines = re.findall(rf"episode {episode}: \S+ in 6 steps\. Belief: .*?\. Truth: {truth}\.", shown)
         assert len(lines) == 2  # with adaptation and without
     assert "truth at" in shown
+
+
+def test_each_demo_has_a_folder_of_its_own(
+    agent_file: Path, tmp_path: Path, tiny_budgets: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        demo, "FAMLE", Mock(load=FAMLE.load, side_effect=lambda *_, **__: FAMLE.load(agent_file, **QUICK))
+    )
+    (tmp_path / "demo").mkdir()  # empty, and so free
+    (tmp_path / "demo-2").mkdir()
+    (tmp_path / "demo-2" / "notes.txt").write_text("of somebody")
+    for name in ("demo", "demo-3"):
+        run_demo(episodes=2, out=tmp_path / "demo")
+        assert {"agent.zip", "returns.png", "robot.gif", "tensorboard"} == {
+            path.name for path in (tmp_path / name).iterdir()
+        }
+    assert [path.name for path in (tmp_path / "demo-2").iterdir()] == ["notes.txt"]
+
+
+def test_captions_say_what_is_wrong_and_what_is_believed() -> None:
+    env = Mock(get_wrapper_attr=lambda _: 0.1)  # a picture each step
+    frame = np.zeros((2, 2, 3), dtype=np.uint8)
+
+    def episode(breaks_at: int | None, beliefs: list[str], frames: int) -> Rollout:
+        n = len(beliefs)
+        return Rollout(
+            np.ones(n), np.zeros((n + 1, 0)), *np.zeros((2, n)), beliefs, 1.0, breaks_at, frames=[frame] * frames
+        )
+
+    runs = [episode(None, ["intact"], 1), episode(1, ["intact", "intact", "dead"], 3), episode(None, ["dead"] * 2, 2)]
+    assert demo._captions(runs, env, "motor 0 dead") == [  # noqa: SLF001
+        "truth: intact\nbelief: intact\nreturn: 1",
+        "truth: intact\nbelief: intact\nreturn: 1",
+        "truth: motor 0 dead\nbelief: intact\nreturn: 2",
+        "truth: motor 0 dead\nbelief: dead\nreturn: 3",
+        "truth: motor 0 dead\nbelief: dead\nreturn: 1",
+        "truth: motor 0 dead\nbelief: dead\nreturn: 2",
+    ]
+
+
+def test_films_have_their_titles_and_captions_above_and_below() -> None:
+    films = {"one": [np.zeros((4, 4, 3), dtype=np.uint8)] * 2, "two": [np.zeros((4, 4, 3), dtype=np.uint8)]}
+    plain = side_by_side(films, size=64)
+    told = side_by_side(films, {"one": ["a", "b"], "two": ["c"]}, size=64)
+    assert len(plain) == len(told) == 2
+    assert told[0].shape[0] > plain[0].shape[0]
+    assert told[0].shape[1] == 128
+    below = [picture[plain[0].shape[0] :] for picture in told]
+    assert (below[0] < 255).any()
+    assert not np.array_equal(below[0][:, :64], below[1][:, :64])
+    assert np.array_equal(below[0][:, 64:], below[1][:, 64:])  # the film that has ended
 
 
 @slow

@@ -2,10 +2,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from benchmarks.reporting.figures import figures
-from benchmarks.reporting.markdown import headline
+from benchmarks.reporting.markdown import headline, in_short
 from benchmarks.reporting.registry import EXPERIMENTS
 from benchmarks.reporting.report import Report
 from benchmarks.reporting.study import read_study
@@ -14,9 +15,13 @@ from tests.stored_results import store_curves, store_gaits
 ROOT = Path(__file__).parents[2]
 
 
-def table_of(results: Path) -> str:
+def figures_of(results: Path) -> dict[str, pd.DataFrame]:
     studies = [study for one in EXPERIMENTS if (study := read_study(one, results)) is not None]
-    return headline({study.experiment.name: figures(study) for study in studies})
+    return {study.experiment.name: figures(study) for study in studies}
+
+
+def table_of(results: Path) -> str:
+    return headline(figures_of(results))
 
 
 @pytest.fixture
@@ -50,7 +55,17 @@ def test_report_begins_with_the_table(results: Path, tmp_path: Path) -> None:
     assert table_of(results) in text.split("## All robots")[1].split("\n## ")[0]
 
 
-def test_readme_and_report_show_what_is_stored() -> None:
-    table = table_of(ROOT / "benchmarks" / "results")
-    assert table in (ROOT / "README.md").read_text(), "quote the first table of benchmarks/report/report.md"
-    assert table in (ROOT / "benchmarks" / "report" / "report.md").read_text()
+def test_short_table_has_a_row_a_robot(results: Path) -> None:
+    assert in_short(figures_of(results)).splitlines() == [
+        "| robot | measured | FAMLE | the same without adaptation | oracle | runs |",
+        "| --- | --- | --- | --- | --- | --- |",
+        "| arm, two faults | return of the first 50 steps | 36.0 |  |  | 2 |",
+    ]
+
+
+def test_texts_show_what_is_stored() -> None:
+    stored = figures_of(ROOT / "benchmarks" / "results")
+    report = (ROOT / "benchmarks" / "report" / "report.md").read_text()
+    for page, table in (("README.md", in_short(stored)), ("docs/results.md", headline(stored))):
+        assert table in report, "python -m benchmarks.reporting"
+        assert table in (ROOT / page).read_text(), f"quote the table of benchmarks/report/report.md in {page}"
