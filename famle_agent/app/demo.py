@@ -192,7 +192,7 @@ def _belief_and_truth(env: FAMLEWrapper) -> str:
 
 def _film_every(env: gym.Env[Any, Any]) -> int:
     """Steps from picture to picture of the film."""
-    return max(1, round(1.0 / (env.get_wrapper_attr("control_period") * _FILM_FPS)))
+    return max(1, round(1.0 / (float(env.get_wrapper_attr("control_period")) * _FILM_FPS)))
 
 
 def _captions(runs: Sequence[Rollout], env: gym.Env[Any, Any], broken: str) -> list[str]:
