@@ -44,7 +44,7 @@ COMMANDS = sorted({command for text in TEXTS for command in commands(text)})
 @pytest.mark.slow
 @pytest.mark.parametrize("text", WITH_PYTHON)
 def test_python_in_the_texts_runs(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In order, in one namespace, as someone would who copies block after block; but for how long a policy is learnt."""
+    """In order, in one namespace, as someone would who copies block after block; policies are learnt for less long."""
     monkeypatch.chdir(tmp_path)
     namespace: dict[str, Any] = {}
     for i, block in enumerate(blocks(text, "python")):
