@@ -106,9 +106,15 @@ def _say(console: Console, text: str) -> None:
 
 
 def _free_folder(wanted: Path) -> Path:
-    """Returns the folder if it is new or empty, else the first free one of ``wanted-2``, ``wanted-3``, ..."""
+    """Returns the folder if it is new or empty, else the first free one of ``wanted-2``, ``wanted-3``, ...
+
+    Raises:
+        ValueError: The folder holds something, and has no name that a number could be added to.
+    """
     folder, number = wanted, 1
     while folder.is_dir() and any(folder.iterdir()):
+        if wanted.name in ("", ".."):
+            raise ValueError(f"{wanted} holds something already; give the name of a new folder.")
         number += 1
         folder = wanted.with_name(f"{wanted.name}-{number}")
     return folder

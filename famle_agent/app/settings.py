@@ -16,11 +16,9 @@ import docstring_parser
 from famle_agent.agents.config import Config
 from famle_agent.agents.keywords import CHOICES, described_by
 from famle_agent.agents.presets import known_robots
-from famle_agent.utils.atomic_write import whole_file
+from famle_agent.utils.marked_text import write_marked
 
 __all__ = ["settings_table", "write_table"]
-
-_BEGIN, _END = "<!-- settings -->", "<!-- /settings -->"
 
 _SWITCHES = {
     "planner": "Which planner plans: " + ", ".join(f"`{name}`" for name in CHOICES["planner"]) + ".",
@@ -55,17 +53,12 @@ def _row(cells: Sequence[str]) -> str:
 
 
 def write_table(path: Path) -> None:
-    """Puts the table between its marks in a page.
+    """Writes the table into a page, between its marks.
 
     Raises:
         ValueError: The page has no marks.
     """
-    text = path.read_text()
-    if _BEGIN not in text or _END not in text:
-        raise ValueError(f"{path} has no lines {_BEGIN} and {_END} for the table to stand between.")
-    before, _, rest = text.partition(_BEGIN)
-    with whole_file(path) as new:
-        new.write_text(f"{before}{_BEGIN}\n\n{settings_table()}\n\n{_END}{rest.partition(_END)[2]}")
+    write_marked(path, "settings", settings_table())
 
 
 def _plain(text: str) -> str:

@@ -183,7 +183,7 @@ def test_path_is_printed_as_it_is(
 
 @pytest.mark.parametrize(
     ("command", "out"),
-    [("meta-learn", "file/a.zip"), ("meta-learn", "folder/agent.zip"), ("demo", "file"), ("demo", "folder")],
+    [("meta-learn", "file/a.zip"), ("meta-learn", "folder/agent.zip"), ("demo", "file"), ("demo", "file/demo")],
 )
 def test_path_that_cannot_be_written_is_refused_before_learning(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], learns_nothing: list[str], command: str, out: str

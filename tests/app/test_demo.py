@@ -86,6 +86,18 @@ def test_each_demo_has_a_folder_of_its_own(
     assert [path.name for path in (tmp_path / "demo-2").iterdir()] == ["notes.txt"]
 
 
+@pytest.mark.parametrize("out", [".", "..", "sub/.."])
+def test_folder_that_no_number_can_be_added_to_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: str
+) -> None:
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "notes.txt").write_text("of somebody")
+    monkeypatch.chdir(tmp_path if out == "sub/.." else tmp_path / "sub")
+    with pytest.raises(ValueError, match="name of a new folder"):
+        run_demo(out=Path(out))
+    assert [path.name for path in tmp_path.iterdir()] == ["sub"]
+
+
 def test_captions_say_what_is_wrong_and_what_is_believed() -> None:
     env = Mock(get_wrapper_attr=lambda _: 0.1)  # a picture each step
     frame = np.zeros((2, 2, 3), dtype=np.uint8)

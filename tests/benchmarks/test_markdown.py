@@ -5,6 +5,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from benchmarks.reporting import quote
 from benchmarks.reporting.figures import figures
 from benchmarks.reporting.markdown import headline, in_short
 from benchmarks.reporting.registry import EXPERIMENTS
@@ -68,4 +69,26 @@ def test_texts_show_what_is_stored() -> None:
     report = (ROOT / "benchmarks" / "report" / "report.md").read_text()
     for page, table in (("README.md", in_short(stored)), ("docs/results.md", headline(stored))):
         assert table in report, "python -m benchmarks.reporting"
-        assert table in (ROOT / page).read_text(), f"quote the table of benchmarks/report/report.md in {page}"
+        assert table in (ROOT / page).read_text(), "python -m benchmarks.reporting.quote"
+
+
+def test_tables_are_quoted_where_they_are_marked(results: Path, tmp_path: Path) -> None:
+    Report(results, tmp_path / "benchmarks" / "report")()
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "README.md").write_text("# Title\n<!-- In short -->old<!-- /In short -->\nthe rest\n")
+    (tmp_path / "docs" / "results.md").write_text("<!-- All robots -->\n<!-- /All robots -->\n")
+    for _ in range(2):
+        quote.main(quote.Args(tmp_path))
+    stored = figures_of(results)
+    assert (tmp_path / "README.md").read_text() == (
+        f"# Title\n<!-- In short -->\n\n{in_short(stored)}\n\n<!-- /In short -->\nthe rest\n"
+    )
+    assert table_of(results) in (tmp_path / "docs" / "results.md").read_text()
+
+
+def test_page_without_a_mark_stays_as_it_is(results: Path, tmp_path: Path) -> None:
+    Report(results, tmp_path / "benchmarks" / "report")()
+    (tmp_path / "README.md").write_text("no marks")
+    with pytest.raises(ValueError, match="In short"):
+        quote.main(quote.Args(tmp_path))
+    assert (tmp_path / "README.md").read_text() == "no marks"
