@@ -171,7 +171,7 @@ def test_environment_that_was_given_later_is_the_one_named(quick_agent: FAMLE, r
 
 
 def test_situation_of_the_environment_is_named(make_env: MakeEnv, reload: Load) -> None:
-    agent = FAMLE(make_env(situation={"motor_gain": [1, 0.5]}), device="cpu")
+    agent = FAMLE(make_env(situation={"motor_gain": [1, 0.5], "partial": True}), device="cpu")
     assert reload(agent).get_env().get_attr("situation")[0].motor_gain[:2] == (1.0, 0.5)
 
 
