@@ -145,7 +145,7 @@ def main(args: Args) -> None:
         agent = agent_of(robot, args.seed)
         for fault in args.faults or FAULTS:
             row = drive(agent, robot, fault, args.steps, args.seed)
-            row |= {"robot": robot, "fault": fault, **provenance(sys.argv[1:])}
+            row |= {"robot": robot, "fault": fault, **provenance(sys.argv)}
             store(file, [row], keys=("robot", "fault"))
     print(load(file).drop(columns=["command", "commit", "versions"]).to_string(index=False))
 
