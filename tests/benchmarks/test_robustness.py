@@ -38,7 +38,7 @@ FOUND: dict[ReaderName, list[bytes]] = {
     "folder": [b"", b"[]", b"\xff", b"{" * 9_999],
     "results": [b"", b"a\n" + b"[" * 9_999, b"method,seed\nfamle,1,2,3\n", b"\xff\xfe"],
 }
-"""Inputs at which a reader once failed otherwise than it promises, or might."""
+"""Inputs at which a reader may fail otherwise than it promises; fuzzing found some of them."""
 
 
 @pytest.mark.parametrize("name", READERS)
