@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import sys
+import weakref
 from contextlib import suppress
 from importlib import import_module
 from typing import Any
@@ -39,6 +41,8 @@ class Pictures:
                 "OSMesa (libosmesa6, and MUJOCO_GL=osmesa in the environment); or use engine='pybullet'."
             ) from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._renderer)
+        # MuJoCo before version 4 ends EGL with the process, and then complains of contexts that are left.
+        atexit.register(_close, weakref.ref(self))
         self._scene = mujoco.MjvScene(model, maxgeom=1000)
         self._options = mujoco.MjvOption()
         self._options.geomgroup[:] = 0
@@ -59,9 +63,16 @@ class Pictures:
 
     def close(self) -> None:
         """Frees what OpenGL holds."""
-        self._context.make_current()
-        self._renderer.free()
-        self._context.free()
+        if self._context is not None:
+            self._context.make_current()
+            self._renderer.free()
+            self._context.free()
+            self._context = None
+
+
+def _close(pictures: weakref.ref[Pictures]) -> None:
+    if (left := pictures()) is not None:
+        left.close()
 
 
 def _gl_context() -> Any:
