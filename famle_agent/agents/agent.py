@@ -38,21 +38,11 @@ from famle_agent.agents.stored_agent import StoredAgent
 from famle_agent.agents.tensorboard import log_adaptations, log_embeddings, log_health, log_posterior
 from famle_agent.agents.world_model import Interface
 from famle_agent.data.action_scaling import to_action_space
-from famle_agent.data.envs import (
-    SituationEnvs,
-    SituationsLike,
-    check_spaces,
-    env_id,
-    env_spec,
-    first_env,
-    other_reward,
-    planning_reward,
-    planning_termination,
-    situation_envs,
-    special_dims,
-)
+from famle_agent.data.description import check_spaces, env_id, env_spec, first_env, special_dims
+from famle_agent.data.envs import SituationEnvs, SituationsLike, situation_envs
 from famle_agent.data.gate import check_action, reading, vec_readings, vec_step
 from famle_agent.data.identity import identity
+from famle_agent.data.objective import other_reward, planning_reward, planning_termination
 from famle_agent.data.policies import MakePolicy, reward_names
 from famle_agent.data.probe import check_reward_fn, check_termination_fn
 from famle_agent.data.transitions import Transitions, check_names

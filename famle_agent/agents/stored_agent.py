@@ -21,7 +21,8 @@ from famle_agent.agents.parameters import Parameters, parameters_of, with_parame
 from famle_agent.agents.policy import AdaptivePolicy
 from famle_agent.agents.presets import make_env
 from famle_agent.agents.world_model import Interface
-from famle_agent.data.envs import different_arguments, env_attribute, situation_envs
+from famle_agent.data.description import different_arguments, env_attribute
+from famle_agent.data.envs import situation_envs
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.reward import RewardFn, TerminationFn
 

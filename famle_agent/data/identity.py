@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from torch import Tensor, nn
 
-from famle_agent.data.envs import ONLOOKERS
+from famle_agent.data.description import ONLOOKERS
 
 __all__ = ["identity"]
 
