@@ -69,20 +69,25 @@ def drawn(split: int, n: int) -> list[Situation]:
     return list(found)
 
 
-def agent_of(name: str, seed: int, cache: Path) -> FAMLE:
-    """Makes the arm's agent with its default settings but for the situations; what it meta-learns is kept."""
-    chosen = SETS[name]
+def agent_of(name: str, seed: int, cache: Path) -> tuple[FAMLE, float | None]:
+    """Makes the arm's agent with its default settings but for the situations; what it meta-learns is kept.
+
+    Returns:
+        The agent, and the processor's seconds that it learnt; None where it was in the cache.
+    """
+    chosen, start = SETS[name], time.process_time()
     agent = FAMLE("reacher", seed=seed, device="cpu", compose=chosen.compose)
     situations = [*ReacherEnv.training_situations, *drawn(1 + seed, chosen.drawn)]
     path = cache / f"reacher-{len(situations)}-situations-{seed}.zip"
-    return from_cache(agent, path, lambda agent: agent.meta_learn(situations))
+    known = path.exists()
+    from_cache(agent, path, lambda agent: agent.meta_learn(situations))
+    return agent, None if known else time.process_time() - start
 
 
 def live(name: str, replicates: int, cache: Path) -> list[Result]:
     """Lets one agent live on all test arms, one after the other."""
-    start = time.process_time()
-    agent = agent_of(name, 0, cache)
-    learning, results = time.process_time() - start, list[Result]()
+    agent, learning = agent_of(name, 0, cache)
+    results = list[Result]()
     for situation in drawn(0, replicates):
         agent.forget()
         agent.set_random_seed(0)
