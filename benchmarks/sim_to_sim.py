@@ -193,7 +193,7 @@ def main(args: Args) -> None:
         found = summary(robot, load(table)).rename(index=lambda method: style_of(method).label)
         bed, where = BEDS[robot], NAMES[OTHER[args.simulator]]
         print(f"\n{robot} in {where}, learnt in {NAMES[args.simulator]}: {bed.label}; recovered: {bed.recovery}")
-        print(found.round(2).to_string())
+        print((found.round(2) + 0.0).to_string())  # without a sign before 0
     with whole_file(args.out / "sim-to-sim.png") as partial_file:
         picture(args.out).savefig(partial_file, format="png", dpi=100)
 
