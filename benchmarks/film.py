@@ -76,26 +76,26 @@ def shrink(film: Path, out: Path, width: int, colours: int) -> None:
 
 
 def read_posterior(folder: Path) -> dict[str, npt.NDArray[np.float64]]:
-    """Reads P(situation | memory) from a run's TensorBoard files, (n,) by name of the situation."""
+    """Reads P(situation | memory) from a run's TensorBoard files: steps and probabilities, (n, 2), by situation."""
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
     events.Reload()
     tags = [tag for tag in events.Tags()["scalars"] if tag.startswith("posterior/")]
-    return {tag.partition("/")[2]: np.array([one.value for one in events.Scalars(tag)]) for tag in tags}
+    return {tag.partition("/")[2]: np.array([(one.step, one.value) for one in events.Scalars(tag)]) for tag in tags}
 
 
 def draw_posterior(posterior: Mapping[str, npt.NDArray[np.float64]], breaks_at: int, path: Path) -> None:
     """Draws how likely each situation is over robot steps, of those that are likely at some time.
 
     Args:
-        posterior: Probabilities (n,) by name of the situation.
+        posterior: Steps and probabilities, (n, 2), by name of the situation.
         breaks_at: The step before which the robot breaks.
         path: Where the PNG goes.
     """
     figure = Figure(figsize=(7.2, 3.2), layout="constrained")
     axes = figure.add_subplot()
     for name, values in posterior.items():
-        if values.max() > _SHOWN:
-            axes.plot(values, label=name)
+        if values[:, 1].max() > _SHOWN:
+            axes.plot(*values.T, label=name)
     axes.axvline(breaks_at, color="0.4", linestyle="--", linewidth=1, label="the ant breaks")
     style(axes, "robot steps", "P(situation | memory)")
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")

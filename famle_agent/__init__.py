@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from famle_agent.adaptation.controller import OnlineState
+    from famle_agent.agents.adaptation_log import AdaptationLog
     from famle_agent.agents.agent import ModelBasedAgent
     from famle_agent.agents.baselines import AMPC, AMPCMAML
     from famle_agent.agents.config import Config
@@ -23,6 +24,7 @@ __all__ = [
     "AMPC",
     "AMPCMAML",
     "FAMLE",
+    "AdaptationLog",
     "Config",
     "FAMLEWrapper",
     "ModelBasedAgent",
@@ -38,6 +40,7 @@ __version__ = version("famle")
 _MODULES = {
     "AMPC": "agents.baselines",
     "AMPCMAML": "agents.baselines",
+    "AdaptationLog": "agents.adaptation_log",
     "Config": "agents.config",
     "FAMLE": "agents.famle",
     "FAMLEWrapper": "agents.wrapper",

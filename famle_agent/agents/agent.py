@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -14,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 import torch
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces, configure_logger
@@ -27,6 +29,7 @@ from famle_agent.adaptation.controller import Adapter, Controller, OnlineState
 from famle_agent.adaptation.diagnosis import Diagnosis
 from famle_agent.adaptation.perception import Perception, senses_of
 from famle_agent.adaptation.senses import Senses
+from famle_agent.agents.adaptation_log import AdaptationLog, Experience, belief_scalars
 from famle_agent.agents.check import Check, check_plans
 from famle_agent.agents.config import Config
 from famle_agent.agents.keywords import SAFETY
@@ -35,7 +38,7 @@ from famle_agent.agents.meta_training import meta_train, planning_policy, simula
 from famle_agent.agents.policy import AdaptivePolicy
 from famle_agent.agents.presets import make_env, robot_of
 from famle_agent.agents.stored_agent import StoredAgent
-from famle_agent.agents.tensorboard import log_adaptations, log_embeddings, log_health, log_posterior
+from famle_agent.agents.tensorboard import log_embeddings
 from famle_agent.agents.world_model import Interface
 from famle_agent.data.action_scaling import to_action_space
 from famle_agent.data.description import check_spaces, env_id, env_spec, first_env, special_dims
@@ -98,6 +101,7 @@ class ModelBasedAgent(StoredAgent):
         num_iterations: Iterations of learning in the last meta-training.
         overruns: How often planning took longer than ``step_budget_ms``.
         cut_short: How often the planner left out iterations, so that it would not.
+        newest: The last step that :meth:`learn` or :meth:`observe` learnt from, and what became of it.
         last_check: What planning was worth in simulation when it ended; None where nobody looked.
 
     Raises:
@@ -203,6 +207,8 @@ class ModelBasedAgent(StoredAgent):
         self._refused: OnlineState | None = None  # the state whose last observation was refused
         self._senses: Senses | None = None  # of the robots of whom learn(), observe() and locate() were told last
         self._calls = 0  # of the environment's steps and resets when learn() last ended
+        self._plan_ms: float | None = None  # what the plan of the step that is under way took
+        self.newest: Experience | None = None
         self._warned_of_divergence = self._warned_of_sensors = False
         self.overruns = self.cut_short = 0
         self.generator.seed()
@@ -457,35 +463,43 @@ class ModelBasedAgent(StoredAgent):
         perception, state, watch = self.perception, self.state_of(env.num_envs), VecWatch(env)
         self._told = None
         self._calls = watch.calls
-        while self.num_timesteps < total_timesteps:
-            hooks.on_rollout_start()
-            if watch.calls != self._calls:  # a callback has moved the robots
-                self._last_obs, self._last_episode_starts = env.reset(), np.ones(env.num_envs, dtype=bool)  # type: ignore[assignment]
-            starts = torch.as_tensor(self._last_episode_starts, dtype=torch.bool, device=self.device)
-            readings = self.policy.builder.tensor(vec_readings(self._last_obs, env))
-            self._last_obs, resets = None, watch.resets()  # the next learn() resets, should this step fail
-            state = perception.begin(state, readings, starts)
-            action, state = self._act(perception, state, starts, self.generator, self._deadline())
-            try:
-                step = vec_step(env, to_action_space(action, self.action_space))
-            except BaseException:
-                self._senses = senses_of(state).dropping(torch.ones_like(starts))
-                raise
-            self.num_timesteps, self._calls = self.num_timesteps + env.num_envs, watch.calls
-            new_obs, rewards, dones, infos = step.obs, step.rewards, step.dones, step.infos  # by names callbacks know
-            reset_alone = watch.resets() - resets != dones if len(resets) else np.zeros_like(dones)
-            lost = torch.as_tensor(reset_alone | ~step.known, device=self.device)
-            state, transitions = perception.sense(state, self.policy.builder.tensor(step.reached), ~lost)
-            state = replace(state, senses=senses_of(state).dropping(lost))
-            state = self._live = self._observed(perception.observe(state, transitions))
-            self._senses = state.senses
-            self._last_obs, self._last_episode_starts = new_obs, dones | reset_alone
-            self._update_info_buffer(infos, dones)
-            hooks.update_locals(locals())
-            if not hooks.on_step():
-                break
-            hooks.on_rollout_end()
-            self._count_episodes(int(dones.sum()), log_interval)
+        logger = Logger(None, []) if log_interval is None else self.logger
+        with closing(AdaptationLog(self, logger, self.num_timesteps)) as log:
+            while self.num_timesteps < total_timesteps:
+                hooks.on_rollout_start()
+                if watch.calls != self._calls:  # a callback has moved the robots
+                    self._last_obs, self._last_episode_starts = env.reset(), np.ones(env.num_envs, dtype=bool)  # type: ignore[assignment]
+                starts = torch.as_tensor(self._last_episode_starts, dtype=torch.bool, device=self.device)
+                readings = self.policy.builder.tensor(vec_readings(self._last_obs, env))
+                self._last_obs, resets = None, watch.resets()  # the next learn() resets, should this step fail
+                state = perception.begin(state, readings, starts)
+                action, state = self._act(perception, state, starts, self.generator, self._deadline())
+                try:
+                    step = vec_step(env, to_action_space(action, self.action_space))
+                except BaseException:
+                    self._senses = senses_of(state).dropping(torch.ones_like(starts))
+                    raise
+                self.num_timesteps, self._calls = self.num_timesteps + env.num_envs, watch.calls
+                new_obs, rewards, dones, infos = (
+                    step.obs,
+                    step.rewards,
+                    step.dones,
+                    step.infos,
+                )  # by names callbacks know
+                reset_alone = watch.resets() - resets != dones if len(resets) else np.zeros_like(dones)
+                lost = torch.as_tensor(reset_alone | ~step.known, device=self.device)
+                state, transitions = perception.sense(state, self.policy.builder.tensor(step.reached), ~lost)
+                state = replace(state, senses=senses_of(state).dropping(lost))
+                state = self._live = self._observed(self._learnt_from(perception, state, transitions))
+                self._senses = state.senses
+                self._last_obs, self._last_episode_starts = new_obs, dones | reset_alone
+                self._update_info_buffer(infos, dones)
+                log.step(self.newest, rewards, dones)
+                hooks.update_locals(locals())
+                if not hooks.on_step():
+                    break
+                hooks.on_rollout_end()
+                self._count_episodes(int(dones.sum()), log_interval)
         hooks.on_training_end()
         return self
 
@@ -512,9 +526,9 @@ class ModelBasedAgent(StoredAgent):
             posterior = self.posterior()
             most_likely = max(posterior, key=lambda name: posterior[name])
             self.logger.record("adapt/situation", most_likely, exclude="tensorboard")
-            log_posterior(self.logger, self.marginals())
-            log_adaptations(self.logger, self._live.belief)
-            log_health(self.logger, senses_of(self._live).counts, self.overruns, self.cut_short)
+            for tag, value in belief_scalars(self, self._live).items():
+                many = tag.startswith("posterior/")
+                self.logger.record(tag, value, exclude=("stdout", "log", "json", "csv") if many else None)
         since_start = self.num_timesteps - self._num_timesteps_at_start
         log_time(self.logger, self.num_timesteps, since_start, self._episode_num, self.start_time)
         self.logger.dump(self.num_timesteps)
@@ -603,11 +617,21 @@ class ModelBasedAgent(StoredAgent):
         deadline: Deadline | None,
     ) -> tuple[torch.Tensor, OnlineState]:
         """Plans by a deadline, and counts what was late."""
+        start = time.perf_counter()
         planned = perception.act(state, starts, generator, deadline)
+        self._plan_ms = 1e3 * (time.perf_counter() - start)
         if deadline is not None:
             self.overruns += deadline.passed
             self.cut_short += deadline.cut_short
         return planned
+
+    def _learnt_from(self, perception: Perception, state: OnlineState, transitions: torch.Tensor) -> OnlineState:
+        """Learns from a step that ends here, and notes what became of it."""
+        start, self.newest = time.perf_counter(), None  # whose memory would be a third one
+        after = perception.observe(state, transitions)
+        self.newest = Experience(state, after, transitions, self._plan_ms, 1e3 * (time.perf_counter() - start))
+        self._plan_ms = None
+        return after
 
     def _deadline(self) -> Deadline | None:
         budget = self.config.safety.step_budget_ms
@@ -654,7 +678,7 @@ class ModelBasedAgent(StoredAgent):
         s = senses_of(state).obs
         state, transitions = perception.sense(replace(state, last=(s, a)), s_next, everyone)
         self._told = s, a, senses_of(state).obs
-        self._live = self._observed(perception.observe(state, transitions))
+        self._live = self._observed(self._learnt_from(perception, state, transitions))
         self._senses = self._live.senses
 
     @torch.inference_mode(mode=False)
@@ -683,7 +707,7 @@ class ModelBasedAgent(StoredAgent):
 
     def forget(self) -> None:
         """Returns to what was meta-learned, as for a robot that was just repaired; counts of sensors begin at 0."""
-        self._live = self._senses = None
+        self._live = self._senses = self.newest = None
 
     def serve(self, wrapper: object, takes_over: bool = True) -> None:
         """Notes whose robot the agent is on.

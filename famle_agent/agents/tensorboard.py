@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
-from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from stable_baselines3.common.logger import HParam, Logger, TensorBoardOutputFormat
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import text as text_summary
 
-from famle_agent.adaptation.belief import Belief
-
-__all__ = ["encode_gif", "log_adaptations", "log_embeddings", "log_gif", "log_health", "log_posterior"]
+__all__ = [
+    "encode_gif",
+    "log_embeddings",
+    "log_gif",
+    "log_settings",
+    "log_values",
+    "picture",
+    "scalar",
+    "shows",
+    "text",
+]
 
 Frames = Sequence[npt.NDArray[np.uint8]]
 
@@ -34,31 +43,58 @@ def log_embeddings(logger: Logger, embeddings: Tensor, situations: Sequence[str]
         writer.add_embedding(embeddings.detach().cpu(), metadata=list(situations), tag="situations", global_step=step)
 
 
-def log_posterior(logger: Logger, posterior: dict[str, float]) -> None:
-    """Records P(situation | memory) of every situation, for TensorBoard alone since there are many."""
-    for name, probability in posterior.items():
-        logger.record(f"posterior/{name}", probability, exclude=("stdout", "log", "json", "csv"))
+def shows(logger: Logger) -> bool:
+    """Says whether a logger has a TensorBoard folder."""
+    return bool(_formats(logger))
 
 
-def log_adaptations(logger: Logger, belief: Belief) -> None:
-    """Records how often robots have adapted, and how often that diverged, all robots together."""
-    logger.record("adapt/adaptations", belief.adaptations)
-    logger.record("adapt/diverged", int(belief.diverged.sum()))
-
-
-def log_health(logger: Logger, sensors: Mapping[str, Tensor], overruns: int, cut_short: int) -> None:
-    """Records what was missing or late, all robots together.
+def log_settings(logger: Logger, settings: Mapping[str, Any], metrics: Sequence[str], step: int) -> None:
+    """Shows the settings of a run as text, and in the table that compares runs (HParams).
 
     Args:
         logger: The agent's logger.
-        sensors: What was counted of the sensors of each robot, (B,), by name.
-        overruns: How often planning took too long.
-        cut_short: How often the planner left out iterations.
+        settings: By name.
+        metrics: Tags of the scalars to compare runs by.
+        step: Where on the time axis.
     """
-    for name, counts in sensors.items():
-        logger.record(f"health/{name}", int(counts.sum()))
-    logger.record("health/overruns", overruns)
-    logger.record("health/cut_short", cut_short)
+    plain = {name: value if isinstance(value, bool | int | float) else str(value) for name, value in settings.items()}
+    table = "\n".join(["| setting | value |", "| --- | --- |", *(f"| {name} | {v} |" for name, v in plain.items())])
+    values = {"settings": table, "hparams": HParam(plain, dict.fromkeys(metrics, 0.0))}
+    for output in _formats(logger):
+        output.write(values, dict.fromkeys(values, ()), step)
+
+
+def log_values(logger: Logger, values: Iterable[Summary.Value], step: int) -> None:
+    """Writes values to TensorBoard alone and at once, all in one event: many small ones cost ten times as much.
+
+    Args:
+        logger: The agent's logger.
+        values: What :func:`scalar`, :func:`text` and :func:`picture` make.
+        step: Where on the time axis.
+    """
+    event = Summary(value=values)
+    for writer in _writers(logger):
+        file = writer._get_file_writer()  # type: ignore[no-untyped-call]  # noqa: SLF001 - the only way to an event
+        file.add_summary(event, step)
+        file.flush()
+
+
+def scalar(tag: str, value: float) -> Summary.Value:
+    """A number, for :func:`log_values`."""
+    return Summary.Value(tag=tag, simple_value=value)
+
+
+def text(tag: str, words: str) -> Summary.Value:
+    """Some words, for :func:`log_values`."""
+    (value,) = text_summary(tag, words).value  # type: ignore[no-untyped-call]
+    return value
+
+
+def picture(tag: str, drawn: Image.Image) -> Summary.Value:
+    """A picture, for :func:`log_values`."""
+    buffer = io.BytesIO()
+    drawn.save(buffer, "PNG", compress_level=1)
+    return _image(tag, drawn.height, drawn.width, buffer.getvalue())
 
 
 def log_gif(logger: Logger, tag: str, frames: Frames, fps: float, step: int) -> None:
@@ -72,10 +108,7 @@ def log_gif(logger: Logger, tag: str, frames: Frames, fps: float, step: int) -> 
         step: Where on the time axis.
     """
     height, width = frames[0].shape[:2]
-    image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=encode_gif(frames, fps))
-    for writer in _writers(logger):
-        file = writer._get_file_writer()  # type: ignore[no-untyped-call]  # noqa: SLF001 - the only way to a GIF
-        file.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
+    log_values(logger, [_image(tag, height, width, encode_gif(frames, fps))], step)
 
 
 def encode_gif(frames: Frames, fps: float) -> bytes:
@@ -88,6 +121,14 @@ def encode_gif(frames: Frames, fps: float) -> bytes:
     return buffer.getvalue()
 
 
+def _image(tag: str, height: int, width: int, encoded: bytes) -> Summary.Value:
+    image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=encoded)
+    return Summary.Value(tag=tag, image=image)
+
+
+def _formats(logger: Logger) -> list[TensorBoardOutputFormat]:
+    return [output for output in logger.output_formats if isinstance(output, TensorBoardOutputFormat)]
+
+
 def _writers(logger: Logger) -> list[SummaryWriter]:
-    formats: list[Any] = logger.output_formats
-    return [output.writer for output in formats if isinstance(output, TensorBoardOutputFormat)]
+    return [output.writer for output in _formats(logger)]

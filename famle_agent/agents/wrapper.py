@@ -11,6 +11,7 @@ import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import RecordConstructorArgs
 
+from famle_agent.agents.adaptation_log import AdaptationLog
 from famle_agent.agents.agent import ModelBasedAgent
 from famle_agent.agents.presets import make_env
 from famle_agent.data import gate
@@ -52,14 +53,15 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
     Args:
         env: The robot's environment.
         agent: A meta-learned agent; one agent serves one wrapper at a time.
+        log: Where to show in TensorBoard what the agent goes through; closing the wrapper ends it.
 
     Raises:
         NotLearnedError: The agent has no model yet.
         ValueError: The environment's spaces or its task are not the agent's.
     """
 
-    def __init__(self, env: gym.Env[Array, Array], agent: ModelBasedAgent) -> None:
-        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, agent=agent)
+    def __init__(self, env: gym.Env[Array, Array], agent: ModelBasedAgent, log: AdaptationLog | None = None) -> None:
+        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, agent=agent, log=log)
         gym.Wrapper.__init__(self, make_env(env))  # type: ignore[arg-type]
         agent.posterior()  # an agent without a model should say so here, not in the middle of a run
         if env.observation_space != agent.observation_space or env.action_space != agent.action_space:
@@ -68,7 +70,7 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
                 f"{agent.observation_space} and {agent.action_space}."
             )
         agent.check_task(env)
-        self.agent, self._watch = agent, Watch(env)
+        self.agent, self.log, self._watch = agent, log, Watch(env)
         self._obs: Array | None = None  # None where nobody knows where the robot is; NaN where no sensor tells
         self._begun = False
         self._calls = self._resets = 0
@@ -129,7 +131,16 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
         if was_reset or dropped:
             self.agent.locate(step.obs, dropped)
         self._know(step.obs)
+        if self.log is not None:
+            ended = step.terminated or step.truncated
+            self.log.step(None if dropped else self.agent.newest, [step.reward], [ended])
         return step.obs, step.reward, step.terminated, step.truncated, step.info | {"famle": self._belief()}
+
+    def close(self) -> None:
+        """Closes the environment, after the last entry in TensorBoard."""
+        if self.log is not None:
+            self.log.close()
+        super().close()
 
     def _know(self, obs: Array | None) -> None:
         """Notes where the robot is, and that nobody has moved it since."""

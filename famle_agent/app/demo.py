@@ -13,12 +13,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
-from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.logger import configure
 
+from famle_agent.agents.adaptation_log import AdaptationLog
 from famle_agent.agents.checkpoint import check_writable
 from famle_agent.agents.famle import FAMLE
 from famle_agent.agents.presets import known_robots
-from famle_agent.agents.tensorboard import encode_gif, log_adaptations, log_gif, log_posterior
+from famle_agent.agents.tensorboard import encode_gif, log_gif, log_values, scalar
 from famle_agent.agents.wrapper import FAMLEWrapper
 from famle_agent.app.plots import plot_paths, plot_returns, plot_speed, side_by_side
 from famle_agent.rollout import Rollout, rollout
@@ -86,8 +87,8 @@ def run_demo(
         runs: dict[str, list[Rollout]] = {}
         for name, agent in agents.items():
             _say(console, f"Running {name}.")
-            log = out / "tensorboard" / name.replace(" ", "_")
-            runs[name] = _run(agent, env, situation, shown, seed, log, console)
+            folder = out / "tensorboard" / name.replace(" ", "_")
+            runs[name] = _run(agent, env, situation, shown, seed, folder, console)
         console.print(_table(runs, robot, broken))
         shown.picture(runs, env, out)
         films = {name: [frame for run in episodes for frame in run.frames] for name, episodes in runs.items()}
@@ -159,33 +160,31 @@ def _run(
     situation: str,
     shown: Demo,
     seed: int,
-    log: Path,
+    folder: Path,
     console: Console,
 ) -> list[Rollout]:
-    """Runs the episodes of one agent, and logs each step, each episode and the film of the last one."""
+    """Runs the episodes of one agent, and logs what it goes through and the film of the last one."""
     agent.set_random_seed(seed)
     env.unwrapped.set_situation(None)  # type: ignore[attr-defined]
-    wrapped, logger, runs, done = FAMLEWrapper(env, agent), configure(str(log), ["tensorboard"]), list[Rollout](), 0
+    logger, runs, done = configure(str(folder), ["tensorboard"]), list[Rollout](), 0
+    log = AdaptationLog(agent, logger)
+    wrapped = FAMLEWrapper(env, agent, log)
     for episode in range(shown.episodes):
         breaks_at = shown.breaks_at[1] if episode == shown.breaks_at[0] else None
         filmed = _film_every(env) if episode in (0, shown.breaks_at[0], shown.episodes - 1) else 0
-        on_step = _step_logger(logger, wrapped, done, console)
-        runs.append(rollout(wrapped, seed if episode == 0 else None, situation, breaks_at, filmed, on_step))
+        progress = _progress(wrapped, console)
+        runs.append(rollout(wrapped, seed if episode == 0 else None, situation, breaks_at, filmed, progress))
         done += runs[-1].steps
         _say(console, f"  episode {episode}: {_outcome(runs[-1])}. {_belief_and_truth(wrapped)}")
-        logger.record("episode/return", runs[-1].total)
-        logger.dump(done)
+        log_values(logger, [scalar("episode/return", runs[-1].total)], done)
+    log.close()
     log_gif(logger, "robot/last_episode", runs[-1].frames, _film_rate(env), done)
     logger.close()
     return runs
 
 
-def _step_logger(logger: Logger, env: FAMLEWrapper, first: int, console: Console) -> Callable[[int, float], None]:
+def _progress(env: FAMLEWrapper, console: Console) -> Callable[[int, float], None]:
     def on_step(step: int, reward: float) -> None:
-        logger.record("step/reward", reward)
-        log_posterior(logger, env.agent.marginals())
-        log_adaptations(logger, env.agent.belief)
-        logger.dump(first + step)
         if (step + 1) % _STEPS_BETWEEN_LINES == 0:
             _say(console, f"  step {step + 1}. {_belief_and_truth(env)}")
 

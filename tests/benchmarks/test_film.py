@@ -7,7 +7,7 @@ from PIL import Image
 from stable_baselines3.common.logger import configure
 
 from benchmarks.film import draw_posterior, read_posterior, shrink
-from famle_agent.agents.tensorboard import encode_gif, log_posterior
+from famle_agent.agents.tensorboard import encode_gif, log_values, scalar
 
 README_FILM = Path(__file__).parents[2] / "docs" / "pictures" / "ant.gif"
 
@@ -25,12 +25,11 @@ def test_film_gets_smaller_and_keeps_its_pictures_and_its_speed(tmp_path: Path) 
 def test_belief_is_read_as_it_was_logged_and_drawn(tmp_path: Path) -> None:
     logger = configure(str(tmp_path / "tb"), ["tensorboard"])
     for step, p in enumerate((0.0, 0.5, 1.0)):
-        log_posterior(logger, {"intact": 1 - p, "joint 2 dead": p})
-        logger.dump(step)
+        log_values(logger, [scalar("posterior/intact", 1 - p), scalar("posterior/joint 2 dead", p)], 10 * step)
     logger.close()
     belief = read_posterior(tmp_path / "tb")
-    np.testing.assert_allclose(belief["joint 2 dead"], [0.0, 0.5, 1.0])
-    np.testing.assert_allclose(belief["intact"], [1.0, 0.5, 0.0])
+    np.testing.assert_allclose(belief["joint 2 dead"], [(0, 0.0), (10, 0.5), (20, 1.0)])
+    np.testing.assert_allclose(belief["intact"], [(0, 1.0), (10, 0.5), (20, 0.0)])
     draw_posterior(belief, 1, tmp_path / "belief.png")
     with Image.open(tmp_path / "belief.png") as picture:
         assert min(picture.size) > 100
