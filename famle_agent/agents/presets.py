@@ -113,5 +113,6 @@ def make_env(env: str | gym.Env[Any, Any] | VecEnv) -> gym.Env[Any, Any] | VecEn
     except (gym.error.Error, ImportError) as error:
         raise ValueError(
             f"Cannot make the environment {env!r} ({error}). Give a robot ({', '.join(robots)}), a registered "
-            "Gymnasium id or an environment."
+            "Gymnasium id or an environment. An id that a package registers begins with it where nobody has imported "
+            "that yet, such as 'famle_envs:FamleAnt-v0'."
         ) from error

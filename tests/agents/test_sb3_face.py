@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3.common.callbacks import LogEveryNTimesteps
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from famle_agent import AMPCMAML, FAMLE, FAMLEWrapper, Transitions
 from famle_agent.adaptation.adapters import EmbeddingAdapter
@@ -242,6 +243,24 @@ def test_each_robot_has_its_own_belief(load_agent: Load) -> None:
     for ask in (agent.posterior, agent.marginals, agent.diagnose):
         with pytest.raises(IndexError, match="robots 0 to 2, not 3"):
             ask(robot=3)
+
+
+@pytest.mark.slow
+def test_processes_of_a_notebook_know_robots_by_the_name_of_their_package(fast: FAMLE) -> None:
+    """A process that is spawned has imported nothing."""
+    kwargs = {"start_method": "spawn"}
+    robots = make_vec_env("famle_envs:FamleReacher-v0", 2, vec_env_cls=SubprocVecEnv, vec_env_kwargs=kwargs)
+    try:
+        fast.set_env(robots)
+        fast.learn(20)
+        assert fast.belief.adaptations == 2
+    finally:
+        robots.close()
+
+
+def test_an_id_that_nobody_knows_is_answered_with_the_package_in_front() -> None:
+    with pytest.raises(ValueError, match="'famle_envs:FamleAnt-v0'"):
+        FAMLE("FamleElephant-v0")
 
 
 def test_what_is_known_of_many_robots_is_of_none_alone(fast: FAMLE) -> None:
