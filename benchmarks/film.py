@@ -51,8 +51,10 @@ def main(args: Args) -> None:
         run_demo("ant", out=folder, seed=args.seed, env=limit, breaks_at=(0, args.breaks_at))
         shrink(folder / "robot.gif", args.out / "ant.gif", args.width, args.colours)
         (args.out / "ant-speed.png").write_bytes((folder / "speed.png").read_bytes())
-        belief = read_posterior(folder / "tensorboard" / "with_adaptation")
-        draw_posterior(belief, args.breaks_at, args.out / "ant-belief.png")
+        events = read_events(folder / "tensorboard" / "with_adaptation")
+        draw_posterior(read_posterior(events), args.breaks_at, args.out / "ant-belief.png")
+        for tag, file in (("posterior", "ant-posterior.png"), ("prediction/path", "ant-path.png")):
+            (args.out / file).write_bytes(events.Images(tag)[-1].encoded_image_string)
 
 
 def shrink(film: Path, out: Path, width: int, colours: int) -> None:
@@ -75,10 +77,15 @@ def shrink(film: Path, out: Path, width: int, colours: int) -> None:
         small[0].save(new, "GIF", save_all=True, append_images=small[1:], duration=milliseconds, loop=0, optimize=True)
 
 
-def read_posterior(folder: Path) -> dict[str, npt.NDArray[np.float64]]:
-    """Reads P(situation | memory) from a run's TensorBoard files: steps and probabilities, (n, 2), by situation."""
-    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+def read_events(folder: Path) -> EventAccumulator:
+    """Reads a run's TensorBoard files."""
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 0})
     events.Reload()
+    return events
+
+
+def read_posterior(events: EventAccumulator) -> dict[str, npt.NDArray[np.float64]]:
+    """Takes P(situation | memory) from a run: steps and probabilities, (n, 2), by situation."""
     tags = [tag for tag in events.Tags()["scalars"] if tag.startswith("posterior/")]
     return {tag.partition("/")[2]: np.array([(one.step, one.value) for one in events.Scalars(tag)]) for tag in tags}
 

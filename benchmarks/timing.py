@@ -2,6 +2,7 @@
 
 python -m benchmarks.timing                                # all parts, on the arm and the ant
 python -m benchmarks.timing --robots ant --parts control   # a whole control step of FAMLE, in an episode
+python -m benchmarks.timing --robots ant --parts logging   # what TensorBoard takes of it
 python -m benchmarks.timing --robots reacher ant quadruped minitaur --parts engines   # PyBullet beside MuJoCo
 
 Whatever is compared takes turns in one run, so that a slow moment of the machine meets all of it. In "step in turns"
@@ -12,6 +13,7 @@ episode, without its adaptation at the end, which grows with the number of episo
 from __future__ import annotations
 
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -26,6 +28,7 @@ import pandas as pd
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger, configure
 
 from benchmarks.methods import famle
 from benchmarks.ppo import from_scratch
@@ -33,7 +36,7 @@ from benchmarks.reporting.study import ROBOT_ALONE, STEPS_IN_TURNS
 from benchmarks.results import provenance, store
 from benchmarks.runner import launch
 from benchmarks.task import Task
-from famle_agent import AMPC, AMPCMAML, FAMLE, FAMLEWrapper, ModelBasedAgent
+from famle_agent import AMPC, AMPCMAML, FAMLE, AdaptationLog, FAMLEWrapper, ModelBasedAgent
 from famle_agent.agents.presets import known_robots
 from famle_agent.planning import RandomShooting
 from famle_agent.rollout import rollout
@@ -67,7 +70,7 @@ class Args:
 
     robots: tuple[str, ...] = ("reacher", "ant")
     """Robots with all modes."""
-    parts: tuple[str, ...] = ("step in turns", "environment", "planning", "control", "engines")
+    parts: tuple[str, ...] = ("step in turns", "environment", "planning", "control", "logging", "engines")
     """What is timed; all but "engines" in PyBullet."""
     turns: int = 5
     """Turns of each method; the median counts."""
@@ -177,11 +180,44 @@ def control(robot: str, args: Args) -> dict[str, float]:
     }
 
 
+class _TimedLog(AdaptationLog):
+    """Takes the time of each step's entry in TensorBoard, in s."""
+
+    def __init__(self, agent: ModelBasedAgent, logger: Logger) -> None:
+        super().__init__(agent, logger)
+        self.seconds = list[float]()
+
+    def step(self, *args: Any) -> None:
+        start = time.perf_counter()
+        super().step(*args)
+        self.seconds.append(time.perf_counter() - start)
+
+
+def logging(robot: str, args: Args) -> dict[str, float]:
+    """Times what TensorBoard takes of the control steps of such an episode."""
+    agent = famle(Task(robot, 0, Situation(), args.cache))
+    with tempfile.TemporaryDirectory() as folder:
+        logger = configure(folder, ["tensorboard"])
+        log = _TimedLog(agent, logger)
+        env = FAMLEWrapper(_make(robot, max_episode_steps=args.steps), agent, log)
+        total = rollout(env, 0, BREAKS[robot], args.steps // 3).step_seconds  # entries included
+        logger.close()
+        env.env.close()
+    taken = np.array(log.seconds)
+    return {
+        "control step without entries (ms)": 1e3 * float((total - taken).mean()),
+        "entries, mean of all steps (ms)": 1e3 * float(taken.mean()),
+        "longest entry (ms)": 1e3 * float(taken.max()),
+        "share of entries": float(taken.sum() / (total - taken).sum()),
+    }
+
+
 PARTS: Mapping[str, Callable[[str, Args], Mapping[str, Any]]] = {
     STEPS_IN_TURNS: in_turns,
     "environment": environment,
     "planning": planning,
     "control": control,
+    "logging": logging,
     "engines": engines,
 }
 """What can be timed."""

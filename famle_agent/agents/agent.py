@@ -29,9 +29,10 @@ from famle_agent.adaptation.controller import Adapter, Controller, OnlineState
 from famle_agent.adaptation.diagnosis import Diagnosis
 from famle_agent.adaptation.perception import Perception, senses_of
 from famle_agent.adaptation.senses import Senses
-from famle_agent.agents.adaptation_log import AdaptationLog, Experience, belief_scalars
+from famle_agent.agents.adaptation_log import AdaptationLog, log_belief
 from famle_agent.agents.check import Check, check_plans
 from famle_agent.agents.config import Config
+from famle_agent.agents.held_out import Experience
 from famle_agent.agents.keywords import SAFETY
 from famle_agent.agents.logs import console_for_bars, log_episodes, log_time
 from famle_agent.agents.meta_training import meta_train, planning_policy, simulate
@@ -480,12 +481,8 @@ class ModelBasedAgent(StoredAgent):
                     self._senses = senses_of(state).dropping(torch.ones_like(starts))
                     raise
                 self.num_timesteps, self._calls = self.num_timesteps + env.num_envs, watch.calls
-                new_obs, rewards, dones, infos = (
-                    step.obs,
-                    step.rewards,
-                    step.dones,
-                    step.infos,
-                )  # by names callbacks know
+                # By names that callbacks know.
+                new_obs, rewards, dones, infos = step.obs, step.rewards, step.dones, step.infos
                 reset_alone = watch.resets() - resets != dones if len(resets) else np.zeros_like(dones)
                 lost = torch.as_tensor(reset_alone | ~step.known, device=self.device)
                 state, transitions = perception.sense(state, self.policy.builder.tensor(step.reached), ~lost)
@@ -523,12 +520,7 @@ class ModelBasedAgent(StoredAgent):
             raise ValueError("The agent has no logger yet; call learn() or set_logger() first.")
         log_episodes(self.logger, self.ep_info_buffer or (), self.ep_success_buffer or ())
         if self._live is not None:
-            posterior = self.posterior()
-            most_likely = max(posterior, key=lambda name: posterior[name])
-            self.logger.record("adapt/situation", most_likely, exclude="tensorboard")
-            for tag, value in belief_scalars(self, self._live).items():
-                many = tag.startswith("posterior/")
-                self.logger.record(tag, value, exclude=("stdout", "log", "json", "csv") if many else None)
+            log_belief(self, self.logger, self._live)
         since_start = self.num_timesteps - self._num_timesteps_at_start
         log_time(self.logger, self.num_timesteps, since_start, self._episode_num, self.start_time)
         self.logger.dump(self.num_timesteps)

@@ -15,9 +15,10 @@ __all__ = ["Path", "draw_paths", "draw_posterior", "liveliest"]
 
 Array = npt.NDArray[Any]
 
-_WIDTH = 640
+_WIDTH = 760
 _ROW = 18  # pixels of a line of text
-_NAMES = 220  # pixels of the names beside a picture
+_NAMES = 280  # pixels of the names beside a picture
+_MARGIN = 120  # and of the ranges beside the panels
 _ROWS = 12  # situations of a picture
 _PANEL = 110  # pixels of the height of a panel
 _PANELS = 4
@@ -55,7 +56,7 @@ def draw_posterior(posterior: Array, names: Sequence[str], first: int, last: int
     draw = ImageDraw.Draw(sheet)
     for row, situation in enumerate(shown):
         draw.text((_NAMES - 6, _ROW * row + 3), _shortened(names[situation]), fill="black", anchor="ra")
-    _label_steps(draw, first, last, bars.height + 3)
+    _label_steps(draw, first, last, bars.height + 3, _NAMES)
     return sheet
 
 
@@ -73,18 +74,20 @@ def draw_paths(paths: Sequence[Path], dims: Sequence[int]) -> Image.Image:
         top = _PANEL * panel
         values = np.concatenate([path.real[:, dim] for path in paths])
         low, high = float(values.min()), float(values.max())
-        draw.rectangle((_NAMES, top + 4, _WIDTH - 1, top + _PANEL - 4), outline="lightgray")
+        draw.rectangle((_MARGIN, top + 4, _WIDTH - 1, top + _PANEL - 4), outline="lightgray")
         draw.text((6, top + 8), f"observation[{dim}]", fill="black")
-        draw.text((_NAMES - 6, top + 8), f"{high:.3g}", fill="gray", anchor="ra")
-        draw.text((_NAMES - 6, top + _PANEL - 20), f"{low:.3g}", fill="gray", anchor="ra")
+        draw.text((_MARGIN - 6, top + 8), f"{high:.3g}", fill="gray", anchor="ra")
+        draw.text((_MARGIN - 6, top + _PANEL - 20), f"{low:.3g}", fill="gray", anchor="ra")
         for path in paths:
-            x = _NAMES + (_WIDTH - 1 - _NAMES) * (path.first + np.arange(len(path.real)) - first) / max(last - first, 1)
+            x = _MARGIN + (_WIDTH - 1 - _MARGIN) * (path.first + np.arange(len(path.real)) - first) / max(
+                last - first, 1
+            )
             for line, colour in ((path.real, "black"), (path.predicted, "red")):
                 above = (line[:, dim] - low) / max(high - low, 1e-9)  # of 1 at the top
                 y = top + 8 + (_PANEL - 16) * (1.0 - above.clip(0.0, 1.0))
                 draw.line(list(zip(x.tolist(), y.tolist(), strict=True)), fill=colour, width=2)
-    draw.text((6, sheet.height - _ROW + 3), "black: real, red: predicted", fill="black")
-    _label_steps(draw, first, last, sheet.height - _ROW + 3)
+    draw.text((_WIDTH // 2, sheet.height - _ROW + 3), "black: real, red: predicted", fill="black")
+    _label_steps(draw, first, last, sheet.height - _ROW + 3, _MARGIN)
     return sheet
 
 
@@ -99,10 +102,12 @@ def liveliest(paths: Sequence[Path], step: Array) -> list[int]:
     return sorted(np.argsort(-spread, kind="stable")[:_PANELS].tolist())
 
 
-def _shortened(name: str, letters: int = 34) -> str:
-    return name if len(name) <= letters else f"{name[: letters - 3]}..."
+def _shortened(name: str, letters: int = 44) -> str:
+    """Leaves out the middle of a long name: two faults at once differ at its ends."""
+    half = letters // 2 - 1
+    return name if len(name) <= letters else f"{name[:half]}...{name[-half:]}"
 
 
-def _label_steps(draw: ImageDraw.ImageDraw, first: int, last: int, y: float) -> None:
-    draw.text((_NAMES, y), f"step {first}", fill="gray")
+def _label_steps(draw: ImageDraw.ImageDraw, first: int, last: int, y: float, left: float) -> None:
+    draw.text((left, y), f"step {first}", fill="gray")
     draw.text((_WIDTH - 2, y), str(last), fill="gray", anchor="ra")

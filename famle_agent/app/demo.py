@@ -167,7 +167,7 @@ def _run(
     agent.set_random_seed(seed)
     env.unwrapped.set_situation(None)  # type: ignore[attr-defined]
     logger, runs, done = configure(str(folder), ["tensorboard"]), list[Rollout](), 0
-    log = AdaptationLog(agent, logger)
+    log = AdaptationLog(agent, logger, share=1.0)
     wrapped = FAMLEWrapper(env, agent, log)
     for episode in range(shown.episodes):
         breaks_at = shown.breaks_at[1] if episode == shown.breaks_at[0] else None

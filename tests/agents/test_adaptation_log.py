@@ -21,9 +21,9 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from famle_agent import AMPC, FAMLE, AdaptationLog, FAMLEWrapper, ModelBasedAgent, Transitions
 from famle_agent.adaptation.belief import Belief
-from famle_agent.agents import adaptation_log
 from famle_agent.agents.pictures import Path as Way
 from famle_agent.agents.pictures import draw_paths, draw_posterior, liveliest
+from famle_agent.utils.allowance import Allowance
 
 Load = Callable[..., FAMLE]
 MakeEnv = Callable[..., gym.Env[Any, Any]]
@@ -52,7 +52,7 @@ NUMBERS = {
 @pytest.fixture(autouse=True)
 def all_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets every adaptation be shown, however long that takes."""
-    monkeypatch.setattr(adaptation_log, "_SHARE", 1e9)
+    monkeypatch.setattr(Allowance, "is_left", lambda _: True)
 
 
 class Breaks(BaseCallback):
@@ -102,7 +102,8 @@ def test_a_robot_that_breaks_is_seen_within_its_episode(load_agent: Load, tmp_pa
     assert dead[-1] > 0.5 > dead[4]
     assert "joint 3 dead" in words(events, "diagnosis")[-1]
     assert "joint 3 dead" not in words(events, "diagnosis")[0]
-    assert picture(events, "posterior").width == picture(events, "prediction/path").width == 640
+    assert [event.step for event in events.Images("posterior")] == [25, 50, 60]
+    assert picture(events, "posterior").width == picture(events, "prediction/path").width == 760
     assert "situations" in (tmp_path / "FAMLE_1" / "projector_config.pbtxt").read_text()
 
 
@@ -166,9 +167,9 @@ def test_logging_changes_nothing(load_agent: Load, tmp_path: Path) -> None:
 def test_entries_come_as_rarely_as_their_share_of_the_time_asks(
     load_agent: Load, make_env: MakeEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(adaptation_log, "_SHARE", 1e-9)
+    monkeypatch.undo()
     agent, logger = load_agent(**FAST), configure(str(tmp_path), ["tensorboard"])
-    env = FAMLEWrapper(make_env(), agent, AdaptationLog(agent, logger))
+    env = FAMLEWrapper(make_env(), agent, AdaptationLog(agent, logger, share=1e-9))
     obs, _ = env.reset(seed=0)
     for _ in range(23):
         obs, *_ = env.step(agent.predict(obs)[0])
@@ -235,7 +236,7 @@ def test_picture_of_the_posterior_is_bright_where_a_situation_is_likely() -> Non
     posterior = np.zeros((100, 30))
     posterior[:50, 3], posterior[50:, 20] = 1.0, 1.0
     drawn = np.asarray(draw_posterior(posterior, [f"situation {i}" for i in range(30)], 1, 100).convert("L"))
-    bars = drawn[:-18, 220:]
+    bars = drawn[:-18, 280:]
     rows = bars.reshape(12, 18, -1).mean(axis=1)
     likely = rows > 150
     assert likely[:, 10].sum() == likely[:, -10].sum() == 1
@@ -251,7 +252,7 @@ def test_picture_of_a_path_shows_what_changes_and_where_predictions_are_off() ->
     assert len(dims) == 4
     pixels = np.asarray(draw_paths(ways, [2]))
     red = (pixels[:110] == (255, 0, 0)).all(axis=2)
-    black = (pixels[:110, 220:] == (0, 0, 0)).all(axis=2)
-    assert red[:, 430:].sum() > 100  # over the right half, where the prediction goes the other way
-    assert black[:, 210:].sum() > 100
-    assert not black[:, :200].any()  # hidden where both are the same
+    black = (pixels[:110, 120:] == (0, 0, 0)).all(axis=2)
+    assert red[:, 450:].sum() > 100  # over the right half, where the prediction goes the other way
+    assert black[:, 330:].sum() > 100
+    assert not black[:, :300].any()  # hidden where both are the same

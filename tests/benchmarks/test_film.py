@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 from stable_baselines3.common.logger import configure
 
-from benchmarks.film import draw_posterior, read_posterior, shrink
+from benchmarks.film import draw_posterior, read_events, read_posterior, shrink
 from famle_agent.agents.tensorboard import encode_gif, log_values, scalar
 
 README_FILM = Path(__file__).parents[2] / "docs" / "pictures" / "ant.gif"
@@ -27,7 +27,7 @@ def test_belief_is_read_as_it_was_logged_and_drawn(tmp_path: Path) -> None:
     for step, p in enumerate((0.0, 0.5, 1.0)):
         log_values(logger, [scalar("posterior/intact", 1 - p), scalar("posterior/joint 2 dead", p)], 10 * step)
     logger.close()
-    belief = read_posterior(tmp_path / "tb")
+    belief = read_posterior(read_events(tmp_path / "tb"))
     np.testing.assert_allclose(belief["joint 2 dead"], [(0, 0.0), (10, 0.5), (20, 1.0)])
     np.testing.assert_allclose(belief["intact"], [(0, 1.0), (10, 0.5), (20, 0.0)])
     draw_posterior(belief, 1, tmp_path / "belief.png")

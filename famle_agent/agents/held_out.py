@@ -1,0 +1,155 @@
+"""How well an agent predicts transitions of its robots that it has not been adapted to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from famle_agent.adaptation.controller import OnlineState
+from famle_agent.adaptation.perception import senses_of
+from famle_agent.agents.pictures import Path
+from famle_agent.models.dynamics import Dynamics
+from famle_agent.models.simulator import Simulator
+
+if TYPE_CHECKING:
+    from famle_agent.agents.agent import ModelBasedAgent
+
+__all__ = ["Experience", "Models", "Step", "Window"]
+
+
+@dataclass(frozen=True)
+class Experience:
+    """Records the newest step of B robots.
+
+    Attributes:
+        before: What the agent believed when it had taken place.
+        after: What it believes since it learnt from it.
+        transitions: Which robots went through a transition that can be learnt from, (B,).
+        plan_ms: Milliseconds that the plan took; None where somebody else has acted.
+        adapt_ms: Those that learning from it took.
+    """
+
+    before: OnlineState
+    after: OnlineState
+    transitions: Tensor
+    plan_ms: float | None
+    adapt_ms: float
+
+    @property
+    def adapted(self) -> bool:
+        """Whether the robots have adapted in this step."""
+        return self.after.belief.adaptations > self.before.belief.adaptations
+
+
+@dataclass(frozen=True)
+class Step:
+    """Keeps of a step of B robots what does not take the room of their memories.
+
+    Attributes:
+        obs: (B, obs_dim).
+        action: In [-1, 1], (B, action_dim).
+        next_obs: (B, obs_dim).
+        valid: Which robots went through a transition, (B,).
+        plan_ms: Milliseconds that the plan took; None where somebody else has acted.
+        adapt_ms: Those of the adaptation; None where nothing was adapted.
+    """
+
+    obs: Tensor
+    action: Tensor
+    next_obs: Tensor
+    valid: Tensor
+    plan_ms: float | None
+    adapt_ms: float | None
+
+    @classmethod
+    def of(cls, experience: Experience, obs: Tensor, action: Tensor) -> Step:
+        """Takes it from an experience that began at ``obs`` with ``action``."""
+        next_obs, adapt_ms = senses_of(experience.before).obs, experience.adapt_ms if experience.adapted else None
+        return cls(obs, action, next_obs, experience.transitions, experience.plan_ms, adapt_ms)
+
+
+@dataclass(frozen=True)
+class Window:
+    """The steps since the last entry, n of each of B robots.
+
+    Attributes:
+        obs: (B, n, obs_dim).
+        action: In [-1, 1], (B, n, action_dim).
+        next_obs: (B, n, obs_dim).
+        valid: Which of them are transitions, (B, n).
+    """
+
+    obs: Tensor
+    action: Tensor
+    next_obs: Tensor
+    valid: Tensor
+
+    @classmethod
+    def of(cls, steps: Sequence[Step]) -> Window:
+        """Puts steps side by side."""
+        names = ("obs", "action", "next_obs", "valid")
+        return cls(*(torch.stack([getattr(step, name) for step in steps], dim=1) for name in names))
+
+    def unbroken(self) -> int:
+        """Counts the steps of the first robot before something other than a transition comes between them."""
+        follows = self.valid[0].clone()
+        follows[1:] &= (self.obs[0, 1:] == self.next_obs[0, :-1]).all(dim=1)
+        return int(follows.long().cumprod(dim=0).sum())
+
+
+@dataclass(frozen=True)
+class Models:
+    """What B robots could have predicted with since the last entry.
+
+    Attributes:
+        unadapted: What was meta-learned, of a robot that has seen nothing.
+        before: As it was before the last adaptation that an entry was written at.
+        after: As it was after that.
+    """
+
+    unadapted: Simulator
+    before: Simulator
+    after: Simulator
+
+    @classmethod
+    def of(cls, agent: ModelBasedAgent, known: OnlineState) -> Models:
+        """Takes what the robots have before their first step."""
+        new = agent.policy.initial(known.robots)
+        begins = agent.adapter.model_for(known.belief, known.memory)
+        return cls(agent.adapter.model_for(new.belief, new.memory), begins, begins)
+
+    def adapted(self, agent: ModelBasedAgent, newest: Experience) -> Models:
+        """Takes what they had before an adaptation, and after it."""
+        states = newest.before, newest.after
+        return Models(self.unadapted, *(agent.adapter.model_for(state.belief, state.memory) for state in states))
+
+    def errors(self, model: Dynamics, window: Window) -> dict[str, float]:
+        """Compares their errors on transitions that none of them has been adapted to, in those of simulation."""
+        if not window.valid.any():
+            return {}
+        return {f"prediction/error_{name}": _error(model, one, window) for name, one in vars(self).items()}
+
+    def path(self, window: Window, horizon: int, last: int) -> Path | None:
+        """Predicts where the first robot's actions lead, at most as far as the planner looks; None without any step."""
+        if not (n := min(window.unbroken(), horizon)):
+            return None
+        predicted = [window.obs[:, None, :1].expand(-1, self.after.members, -1, -1)]  # (B, P, 1, obs_dim)
+        for action in window.action[:, :n].unbind(dim=1):
+            predicted.append(self.after(predicted[-1], action[:, None]))
+        real = torch.cat([window.obs[0, :1], window.next_obs[0, :n]])
+        robots, steps = window.valid.shape
+        mean = torch.cat(predicted, dim=2)[0].mean(dim=0)
+        return Path(last - robots * steps, real.cpu().numpy(), mean.cpu().numpy())
+
+
+def _error(model: Dynamics, simulator: Simulator, window: Window) -> float:
+    """Computes the root mean square of the errors of the next observation, in those of simulation."""
+    obs, noise = window.obs[:, None], model.noise_std[: model.members, None]  # (B, 1, n, obs_dim), (P, 1, obs_dim)
+    predicted = model.layout.change(obs, simulator(window.obs, window.action))  # (B, P, n, obs_dim)
+    off = (predicted - model.layout.change(obs, window.next_obs[:, None])) / (model.target_std * noise)
+    mean_square = off.square().mean(dim=(1, 3))[window.valid].mean()
+    return float(mean_square.sqrt() / model.usual_error)
