@@ -278,4 +278,6 @@ def systematic_sample(posterior: Tensor, n: int, offset: float) -> Tensor:
 
 def choose(kept: Tensor, mine: Tensor, theirs: Tensor) -> Tensor:
     """Takes ``mine`` where ``kept`` is set, else ``theirs``; it has the first axes of both."""
+    if mine is theirs:  # as the networks are wherever only the posterior changes; copying them at each step costs time
+        return mine
     return torch.where(kept.view(*kept.shape, *[1] * (mine.ndim - kept.ndim)), mine, theirs)

@@ -55,7 +55,7 @@ class InnerLoop:
         theta = {name: value.detach().clone().requires_grad_() for name, value in theta.items()}
         h = h.detach().clone().requires_grad_()
         groups = [{"params": list(theta.values()), "lr": self.lr}, {"params": [h], "lr": self.embedding_lr}]
-        optimizer = {"sgd": torch.optim.SGD, "adam": torch.optim.Adam}[self.optimizer](groups, foreach=True)
+        optimizer = {"sgd": torch.optim.SGD, "adam": torch.optim.Adam}[self.optimizer](groups, fused=True)
         losses = []
         with torch.enable_grad():
             for _ in range(self.steps):

@@ -127,7 +127,7 @@ class Network:
     def through(self, layers: Layers, x: Tensor) -> Tensor:
         """Computes the last layers, (K, n, in) -> (K, n, outputs)."""
         for weight, bias in layers[:-1]:
-            x = self._activate(torch.baddbmm(bias, x, weight), inplace=not torch.is_grad_enabled())
+            x = self._activate(torch.baddbmm(bias, x, weight))
         weight, bias = layers[-1]
         z = torch.baddbmm(bias, x, weight)
         return self.output_limit * z.tanh() if self.output_limit else z
@@ -136,5 +136,6 @@ class Network:
         layers = range(1, len(self.hidden) + 1)
         return [(theta[f"weight_{layer}"], theta[f"bias_{layer}"][:, None]) for layer in layers]
 
-    def _activate(self, z: Tensor, inplace: bool = False) -> Tensor:
+    def _activate(self, z: Tensor) -> Tensor:
+        inplace = not torch.is_grad_enabled()
         return F.silu(z, inplace=inplace) if self.activation == "silu" else F.relu(z, inplace=inplace)

@@ -113,24 +113,46 @@ def imagine(model: Callable[[Tensor, Tensor], Tensor], objective: Objective, obs
     Returns:
         The return of each candidate, (K, N); -inf where a model left the finite numbers.
     """
-    at_once = max(1, _CANDIDATES_AT_ONCE.get(obs.device.type, 2500) // len(actions))
+    at_once = max(1, _candidates_at_once(obs.device) // len(actions))
     returns = [_imagine(model, objective, obs, part) for part in torch.split(actions, at_once, dim=1)]
     return torch.cat(returns, dim=1).nan_to_num(nan=-math.inf, posinf=-math.inf, neginf=-math.inf)
 
 
 def _imagine(model: Callable[[Tensor, Tensor], Tensor], objective: Objective, obs: Tensor, actions: Tensor) -> Tensor:
-    state = obs[:, None].expand(-1, actions.shape[1], -1)  # (K, N, obs_dim)
-    total = obs.new_zeros(actions.shape[:2])
-    weight: Tensor | float = 1.0  # gamma^t, and 0 once the episode has ended
+    path = [obs[:, None].expand(-1, actions.shape[1], -1)]  # (K, N, obs_dim) each
     for action in actions.unbind(dim=2):
-        next_state = model(state, action)
-        reward = torch.as_tensor(objective.reward_fn(state, action, next_state), dtype=total.dtype, device=total.device)
-        total = total + weight * reward
-        if objective.termination_fn is not None:
-            weight = weight * (1.0 - objective.termination_fn(next_state).to(total.dtype))
-        weight = weight * objective.discount
-        state = next_state
-    return total if objective.value_fn is None else total + weight * objective.value_fn(state)
+        path.append(model(path[-1], action))
+    states = torch.stack(path, dim=1)  # (K, H + 1, N, obs_dim)
+    gamma = objective.discount ** torch.arange(len(path), dtype=states.dtype, device=states.device)
+    weight = gamma[:, None].expand(states.shape[:3])
+    if objective.termination_fn is not None:
+        ended = objective.termination_fn(states[:, 1:].flatten(1, 2)).view(states[:, 1:].shape[:3])
+        goes_on = (1.0 - ended.to(states.dtype)).cumprod(dim=1)
+        weight = weight * torch.cat([torch.ones_like(goes_on[:, :1]), goes_on], dim=1)
+    total = (weight[:, :-1] * _rewards(objective, states, actions)).sum(dim=1)
+    return total if objective.value_fn is None else total + weight[:, -1] * objective.value_fn(path[-1])
+
+
+def _rewards(objective: Objective, states: Tensor, actions: Tensor) -> Tensor:
+    """Computes the rewards of all steps, (K, H, N), in calls of as many transitions as stay in the cache.
+
+    Args:
+        objective: Has the reward function.
+        states: What each candidate goes through, (K, H + 1, N, obs_dim).
+        actions: What it does, (K, N, H, action_dim).
+    """
+    transitions = states[:, :-1], actions.transpose(1, 2), states[:, 1:]
+    at_once = max(1, _candidates_at_once(states.device) // len(states))
+    parts = zip(*(values.flatten(1, 2).split(at_once, dim=1) for values in transitions), strict=True)
+    rewards = [
+        torch.as_tensor(objective.reward_fn(*part), dtype=states.dtype, device=states.device).expand(part[0].shape[:2])
+        for part in parts
+    ]
+    return torch.cat(rewards, dim=1).view(states[:, 1:].shape[:3])
+
+
+def _candidates_at_once(device: torch.device) -> int:
+    return _CANDIDATES_AT_ONCE.get(device.type, _CANDIDATES_AT_ONCE["cpu"])
 
 
 def _in_units_of_the_environment(model: Dynamics, layers: Layers) -> Layers:
