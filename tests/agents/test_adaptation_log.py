@@ -178,6 +178,44 @@ def test_entries_come_as_rarely_as_their_share_of_the_time_asks(
     assert steps_of(read(tmp_path), "adapt/adaptations") == [5, 23]  # the first, and what had come until the end
 
 
+def test_what_came_before_an_error_is_shown(load_agent: Load, tmp_path: Path) -> None:
+    class Fails(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 8:
+                raise RuntimeError("a cable broke")
+            return True
+
+    agent = load_agent(**FAST, tensorboard_log=str(tmp_path))
+    with pytest.raises(RuntimeError, match="a cable broke"):
+        agent.learn(20, callback=Fails())
+    events = read(tmp_path / "FAMLE_1")
+    assert steps_of(events, "adapt/adaptations") == [5, 8]
+    assert [event.step for event in events.Images("posterior")] == [8]
+
+
+@pytest.mark.filterwarnings("ignore:An observation of robot 0 cannot be a measurement")
+def test_readings_that_are_no_measurements_are_no_part_of_the_errors(
+    load_agent: Load, make_env: MakeEnv, tmp_path: Path
+) -> None:
+    class Blinks(gym.ObservationWrapper):
+        steps = 0
+
+        def observation(self, observation: Any) -> Any:
+            self.steps += 1
+            return np.full_like(observation, np.nan) if self.steps % 4 == 0 else observation
+
+    agent, logger = load_agent(**FAST), configure(str(tmp_path), ["tensorboard"])
+    env = FAMLEWrapper(Blinks(make_env()), agent, AdaptationLog(agent, logger))
+    obs, _ = env.reset(seed=0)
+    for _ in range(20):
+        obs, *_ = env.step(agent.predict(obs)[0])
+    env.close()
+    logger.close()
+    events = read(tmp_path)
+    assert events.Scalars("health/quarantined")[-1].value == 10
+    assert all(0 < event.value < 100 for event in events.Scalars("prediction/error_after"))
+
+
 def test_nothing_is_written_without_a_folder_or_an_interval(load_agent: Load, tmp_path: Path) -> None:
     agent = load_agent(**FAST, tensorboard_log=str(tmp_path))
     agent.learn(10, log_interval=None)

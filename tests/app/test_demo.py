@@ -32,10 +32,14 @@ SHOWN = {
 """What TensorBoard has of each run."""
 
 
-def scalars(folder: Path) -> set[str]:
+def read(folder: Path) -> EventAccumulator:
     events = EventAccumulator(str(folder))
     events.Reload()
-    return set(events.Tags()["scalars"])
+    return events
+
+
+def scalars(folder: Path) -> set[str]:
+    return set(read(folder).Tags()["scalars"])
 
 
 @slow
@@ -78,7 +82,10 @@ def test_demo_says_in_words_what_broke_and_how_far_it_is(
         assert len(lines) == 2  # with adaptation and without
     assert "truth at" in shown
     for name in ("with_adaptation", "without_adaptation"):
-        assert scalars(tmp_path / "tensorboard" / name) >= SHOWN
+        events = read(tmp_path / "tensorboard" / name)
+        assert set(events.Tags()["scalars"]) >= SHOWN
+        assert set(events.Tags()["images"]) >= {"posterior", "prediction/path", "robot/last_episode"}
+        assert events.Scalars("posterior/joint 3 dead")[-1].step == 12  # of two episodes of 6
 
 
 def test_each_demo_has_a_folder_of_its_own(
