@@ -26,7 +26,7 @@ Result = dict[str, Any]
 
 _TEXT = {
     *("method", "situation", "later", "believed", "profile", "settings", "device", "command", "commit"),
-    *("robot", "fault", "part", "figure", "data", "candidates", "adaptation", "title"),
+    *("robot", "fault", "part", "figure", "data", "candidates", "adaptation", "title", "machine"),
 }
 """Columns of text. A setting's name such as 12345678 is no number."""
 

@@ -18,6 +18,9 @@ __all__ = ["Simulator", "imagine"]
 _CANDIDATES_AT_ONCE = {"cpu": 2500, "cuda": 1_000_000}
 """By kind of device: what stays in a processor's cache over the whole horizon, or fills a GPU."""
 
+_FEWEST_AT_ONCE = 64
+"""Of each network, since reading its weights once more takes as long as judging some tens of candidates."""
+
 
 class Simulator:
     """Predicts as :meth:`Dynamics.predict` does, for B robots whose theta and h do not change.
@@ -113,7 +116,7 @@ def imagine(model: Callable[[Tensor, Tensor], Tensor], objective: Objective, obs
     Returns:
         The return of each candidate, (K, N); -inf where a model left the finite numbers.
     """
-    at_once = max(1, _candidates_at_once(obs.device) // len(actions))
+    at_once = _candidates_at_once(actions)
     returns = [_imagine(model, objective, obs, part) for part in torch.split(actions, at_once, dim=1)]
     return torch.cat(returns, dim=1).nan_to_num(nan=-math.inf, posinf=-math.inf, neginf=-math.inf)
 
@@ -142,8 +145,8 @@ def _rewards(objective: Objective, states: Tensor, actions: Tensor) -> Tensor:
         actions: What it does, (K, N, H, action_dim).
     """
     transitions = states[:, :-1], actions.transpose(1, 2), states[:, 1:]
-    at_once = max(1, _candidates_at_once(states.device) // len(states))
-    parts = zip(*(values.flatten(1, 2).split(at_once, dim=1) for values in transitions), strict=True)
+    at_once = _candidates_at_once(states)
+    parts = zip(*(torch.split(values.flatten(1, 2), at_once, dim=1) for values in transitions), strict=True)
     rewards = [
         torch.as_tensor(objective.reward_fn(*part), dtype=states.dtype, device=states.device).expand(part[0].shape[:2])
         for part in parts
@@ -151,8 +154,10 @@ def _rewards(objective: Objective, states: Tensor, actions: Tensor) -> Tensor:
     return torch.cat(rewards, dim=1).view(states[:, 1:].shape[:3])
 
 
-def _candidates_at_once(device: torch.device) -> int:
-    return _CANDIDATES_AT_ONCE.get(device.type, _CANDIDATES_AT_ONCE["cpu"])
+def _candidates_at_once(values: Tensor) -> int:
+    """Says how many candidates to judge at once in each of K networks, given values (K, ...) of theirs."""
+    of_all = _CANDIDATES_AT_ONCE.get(values.device.type, _CANDIDATES_AT_ONCE["cpu"])
+    return max(_FEWEST_AT_ONCE, of_all // len(values))
 
 
 def _in_units_of_the_environment(model: Dynamics, layers: Layers) -> Layers:

@@ -148,6 +148,40 @@ def test_return_is_the_sum_of_the_rewards() -> None:
     torch.testing.assert_close(imagine(point_mass, Objective(reward), obs, actions), expected)
 
 
+@pytest.mark.parametrize(("networks", "candidates"), [(1, 1), (2, 3), (2, 2000), (3000, 70)])
+@pytest.mark.parametrize("discount", [0.0, 0.9, 1.0])
+def test_return_is_discounted_ends_with_the_episode_and_looks_beyond(
+    networks: int, candidates: int, discount: float
+) -> None:
+    torch.manual_seed(0)
+    obs, actions = torch.rand(networks, 2), torch.rand(networks, candidates, 4, 2)
+
+    def reward(state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+        return (state * next_state).sum(dim=-1) - action[..., 0]
+
+    def ends(state: Tensor) -> Tensor:
+        return state[..., 0] > 0.8
+
+    state, expected = obs[:, None].expand(-1, candidates, -1), torch.zeros(networks, candidates)
+    goes_on = torch.ones(networks, candidates)
+    for t in range(4):
+        next_state = point_mass(state, actions[:, :, t])
+        expected += discount**t * goes_on * reward(state, actions[:, :, t], next_state)
+        state, goes_on = next_state, goes_on * ~ends(next_state)
+    expected += discount**4 * goes_on * 5.0 * state[..., 1]
+    objective = Objective(reward, ends, lambda state: 5.0 * state[..., 1], discount)
+    torch.testing.assert_close(imagine(point_mass, objective, obs, actions), expected)
+
+
+def test_reward_may_be_a_number_and_may_differ_between_robots() -> None:
+    obs, actions = torch.zeros(2, 2), torch.rand(2, 3, 4, 2)
+    same = imagine(point_mass, Objective(lambda obs, action, next_obs: 0.5), obs, actions)  # type: ignore[arg-type,return-value]
+    torch.testing.assert_close(same, torch.full((2, 3), 2.0))
+    of_each = torch.tensor([1.0, -1.0])[:, None]
+    own = imagine(point_mass, Objective(lambda obs, action, next_obs: of_each * action[..., 0]), obs, actions)
+    torch.testing.assert_close(own, of_each * actions[..., 0].sum(dim=2))
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_return_that_is_no_number_is_the_worst(bad: float) -> None:
     actions = torch.tensor([[[[bad]], [[0.0]]]])

@@ -1,0 +1,496 @@
+"""What speed costs: each part of the package beside the raw cost of the same work, on one machine, in one run.
+
+python -m benchmarks.performance                                   # all parts, on all robots
+python -m benchmarks.performance --robots ant --parts control      # whole control steps of the ant
+
+What is compared takes turns, and the processor's time counts, so that a slow moment of the machine or another process
+changes ratios little. Of parallel processes the wall time counts. Networks are untrained where none is shipped, since
+a step costs the same whatever they know. How a cost grows is the slope of a line fitted to both logarithms: 1 is
+growth in proportion.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import torch
+from stable_baselines3.common.logger import Logger, configure
+from torch import Tensor, nn
+
+from benchmarks.results import provenance, store
+from benchmarks.runner import launch
+from benchmarks.task import Task
+from famle_agent import FAMLE, AdaptationLog, FAMLEWrapper, ModelBasedAgent
+from famle_agent.adaptation.controller import OnlineState
+from famle_agent.agents.presets import known_robots
+from famle_agent.agents.world_model import WorldModel
+from famle_agent.data.collect import collect
+from famle_agent.data.policies import MakePolicy, make_held_uniform
+from famle_agent.models.dynamics import Batch, Dynamics
+from famle_agent.models.gradient_steps import InnerLoop
+from famle_agent.training.reptile import Reptile
+from famle_envs.engines import ENGINES
+
+ROBOTS = ("reacher", "ant", "quadruped", "minitaur")
+"""Robots that are timed."""
+
+_SITUATIONS = 20  # of untrained models
+_ROWS_IN_CACHE = 2500  # of a product
+_MOST_CANDIDATES = 50_000  # embeddings and sums; more take more memory than a small computer has
+
+
+@dataclass(frozen=True)
+class Args:
+    """Times all that takes time."""
+
+    robots: tuple[str, ...] = ROBOTS
+    """Robots that are timed."""
+    parts: tuple[str, ...] = (
+        *("planning", "adaptation", "selection", "training", "environment", "collection", "control"),
+        *("logging", "many robots", "growth", "start-up"),
+    )
+    """What is timed."""
+    repeats: int = 20
+    """Timings of a figure; the median counts. What takes long is timed less often."""
+    steps: int = 300
+    """Control steps of an episode."""
+    batches: tuple[int, ...] = (1, 8, 64, 512)
+    """B, robots at once."""
+    embeddings: tuple[int, ...] = (10, 100, 1000, 10_000)
+    """N, embeddings to select from; with the sums of two where these are at most 50,000."""
+    transitions: int = 2000
+    """Transitions that a process collects by chance; a fiftieth of them while planning."""
+    threads: int = 1
+    """Threads of torch."""
+    out: Path = Path("benchmarks/results")
+    """Folder of performance.csv."""
+
+    def __post_init__(self) -> None:
+        for name, known in ((self.robots, ROBOTS), (self.parts, PARTS)):
+            if unknown := set(name) - set(known):
+                raise ValueError(f"There is nothing to time of {', '.join(unknown)}. Known: {', '.join(known)}.")
+
+
+# --- what is timed ----------------------------------------------------------------------------------------------------
+
+
+def planning(robot: str, args: Args) -> dict[str, float]:
+    """Times plans at our defaults and at the paper's budget against the bare matrix products of the same shapes."""
+    ratios, times, obs = dict[str, float](), dict[str, float](), _make(robot).reset(seed=0)[0]
+    for mode in ("ours", "paper"):
+        agent = _agent(robot, mode)
+        planner, model = agent.config.planner, agent.policy.model
+        # Bare products are fastest where what they work on stays in the processor's cache.
+        parts = -(-planner.candidates // _ROWS_IN_CACHE)
+        products = _products(model, model.members, planner.candidates // parts)
+        steps = parts * planner.horizon * getattr(planner, "iterations", 1)
+        plan, bare = _medians(max(3, args.repeats // 4), partial(agent.predict, obs), partial(_repeat, steps, products))
+        ratios[f"{mode}: plan / bare products"] = plan / bare
+        times |= {f"{mode}: plan (ms)": plan, f"{mode}: bare products (ms)": bare}
+    return ratios | times
+
+
+def adaptation(robot: str, args: Args) -> dict[str, float]:
+    """Times an adaptation with a full memory against the bare products of its gradient steps."""
+    agent = _agent(robot)
+    adapter, state, how = agent.controller.adapter, _experienced(agent, 1), agent.config.adaptation.gradient
+    if how is None:
+        (adapt,) = _medians(args.repeats, partial(adapter.adapt, state.memory, state.belief))
+        return {"adaptation (ms)": adapt}
+    model, k = agent.policy.model, how.inner_loop(state.memory.seen).steps
+    products = _products(model, model.members, how.batch_size or state.memory.seen, backward=True)
+    adapt, bare = _medians(
+        max(3, args.repeats // 4),
+        partial(adapter.adapt, state.memory, state.belief),
+        partial(_repeat, k, products),
+    )
+    return {
+        "adaptation / bare products": adapt / bare,
+        "adaptation (ms)": adapt,
+        "gradient steps": k,
+        "bare products (ms)": bare,
+    }
+
+
+def selection(robot: str, args: Args) -> dict[str, float]:
+    """Times how a transition is judged and the posterior updated, over N embeddings with and without their sums."""
+    figures = dict[str, float]()
+    for compose in (False, True):
+        sizes, milliseconds = list[int](), list[float]()
+        for n in args.embeddings:
+            candidates = n + (n - 1) * (n - 2) // 2 if compose else n
+            if candidates > _MOST_CANDIDATES:
+                continue
+            observe = _observe(_agent(robot, situations=n, compose=compose, adapt_every=10**6))
+            sizes.append(n)
+            milliseconds += _medians(max(3, args.repeats // 4), observe)
+        name = "embeddings and their sums" if compose else "embeddings"
+        figures |= {f"{name}: N = {n} (ms)": ms for n, ms in zip(sizes, milliseconds, strict=True)}
+        figures[f"{name}: growth with N"] = _growth(sizes, milliseconds)
+    return figures
+
+
+def training(robot: str, args: Args) -> dict[str, float]:
+    """Times inner gradient steps of Algorithm 1 against bare products, and a port of it that does one by one."""
+    k, size, data = 20, 32, 500
+    builder = _agent(robot).policy.builder
+    model = replace(builder, config=replace(builder.config, members=1)).dynamics(_SITUATIONS)
+    x, y = torch.randn(_SITUATIONS, data, model.n_features + model.action_dim), torch.randn(1, 1, model.obs_dim)
+    batch = Batch(x, y.expand(_SITUATIONS, data, -1).contiguous(), torch.ones(_SITUATIONS, data))
+    chance = torch.Generator().manual_seed(0)
+    ours = Reptile(10**6, meta_batch_size=_SITUATIONS, batch_size=size).steps(model, batch, InnerLoop(k), chance)
+    products = _products(model, _SITUATIONS, size, backward=True)
+    meta, one_by_one, bare = _medians(
+        max(3, args.repeats // 4),
+        partial(next, ours),
+        OneByOne(model, batch, InnerLoop(k), size).situation,
+        partial(_repeat, k, products),
+    )
+    step, port, raw = meta / (k * _SITUATIONS), one_by_one / k, bare / (k * _SITUATIONS)
+    return {
+        "steps of a sequential port / ours (time)": port / step,
+        "ours / bare products": step / raw,
+        "ours (steps / s)": 1e3 / step,
+        "sequential port (steps / s)": 1e3 / port,
+        "bare products (steps / s)": 1e3 / raw,
+    }
+
+
+class OneByOne:
+    """Algorithm 1 as it is written: one situation after the other, with PyTorch's own layers.
+
+    Args:
+        model: Says how large the network is.
+        data: Transitions of N situations.
+        inner_loop: U^k.
+        batch_size: Transitions per step.
+    """
+
+    def __init__(self, model: Dynamics, data: Batch, inner_loop: InnerLoop, batch_size: int) -> None:
+        E, sizes = model.embeddings.shape[-1], _sizes(model)
+        sizes = [sizes[0] + E, *sizes[1:]]
+        layers = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b, dtype=torch.float32), nn.SiLU())]
+        self.theta, self.H = nn.Sequential(*layers[:-1]), torch.randn(len(data.x), E)
+        self.data, self.inner_loop, self.batch_size, self.iteration = data, inner_loop, batch_size, 0
+
+    def situation(self) -> None:
+        """Runs lines 10 to 13 for the next situation."""
+        c = self.iteration % len(self.H)
+        theta, h = copy.deepcopy(self.theta), self.H[c].clone().requires_grad_()
+        groups = [{"params": [*theta.parameters()], "lr": self.inner_loop.lr}, {"params": [h], "lr": 1e-2}]
+        optimizer = torch.optim.SGD(groups)
+        for _ in range(self.inner_loop.steps):
+            i = torch.randint(self.data.x.shape[1], (self.batch_size,))
+            predicted = theta(torch.cat([self.data.x[c, i], h.expand(self.batch_size, -1)], dim=1))
+            loss = nn.functional.mse_loss(predicted, self.data.y[c, i])
+            optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            optimizer.step()
+        with torch.no_grad():
+            for mine, adapted in zip(self.theta.parameters(), theta.parameters(), strict=True):
+                mine.lerp_(adapted, 0.5)
+            self.H[c] = self.H[c].lerp(h, 0.5)
+        self.iteration += 1
+
+
+def environment(robot: str, args: Args) -> dict[str, float]:
+    """Times a step of the environment in each engine against the bare physics, and a second of its own time."""
+    ratios, times = dict[str, float](), dict[str, float]()
+    for engine in ENGINES:
+        env: Any = _make(robot, engine=engine).unwrapped
+        action = np.full(env.action_space.shape, 0.3)
+        bare = partial(env.world.simulate, env.physics_steps)
+        step, raw = _medians(5 * args.repeats, partial(env.step, action), bare)
+        times |= {f"{engine}: step (ms)": step, f"{engine}: bare physics (ms)": raw}
+        times[f"{engine}: simulated second (ms)"] = step / env.control_period
+        ratios[f"{engine}: step / bare physics"] = step / raw
+        env.close()
+    return ratios | times
+
+
+def collection(robot: str, args: Args) -> dict[str, float]:
+    """Times the collection of transitions by chance and by planning, with one process and with two; wall time."""
+    agent = _agent(robot)
+    sources = agent.situation_envs().sources[:4]
+    names = [f"situation {i}" for i in range(len(sources))]
+    kinds: dict[str, tuple[MakePolicy, int]] = {
+        "by chance": (make_held_uniform(agent.config.simulation.action_hold), args.transitions),
+        "planned": (agent.planning_policy(), max(2, args.transitions // 50)),
+    }
+    ratios, speeds = dict[str, float](), dict[str, float]()
+    for kind, (policy, n) in kinds.items():
+        for jobs in (1, 2):
+            collect(sources, names, 2, policy, 0, n_jobs=jobs)  # starts the processes
+            start = time.perf_counter()
+            collect(sources, names, n, policy, 0, n_jobs=jobs)
+            seconds = time.perf_counter() - start
+            speeds[f"{kind}, {jobs} process(es) (steps / s)"] = len(sources) * n / seconds
+        one, two = list(speeds.values())[-2:]
+        ratios[f"{kind}: two processes / one"] = two / one
+    return ratios | speeds
+
+
+def control(robot: str, args: Args) -> dict[str, float]:
+    """Times whole control steps against the robot's period: plan, simulation, evidence and adaptation."""
+    agent = _agent(robot)
+    env = FAMLEWrapper(_make(robot), agent)
+    obs, _ = env.reset(seed=0)
+    milliseconds = np.zeros(args.steps)
+    for i in range(args.steps):
+        start = time.process_time()
+        obs, _, terminated, truncated, _ = env.step(agent.predict(obs)[0])
+        milliseconds[i] = 1e3 * (time.process_time() - start)
+        if terminated or truncated:
+            obs, _ = env.reset()
+    period, mean, late = 1e3 * env.get_wrapper_attr("control_period"), milliseconds[10:].mean(), milliseconds[10:]
+    env.close()
+    return {
+        "mean / period": mean / period,
+        "99th percentile / period": float(np.percentile(late, 99)) / period,
+        "within the period": float((late <= period).mean()),
+        "mean (ms)": mean,
+        "median (ms)": float(np.median(late)),
+        "99th percentile (ms)": float(np.percentile(late, 99)),
+        "period (ms)": period,
+    }
+
+
+class _TimedLog(AdaptationLog):
+    """Takes the time of each step's entry in TensorBoard, in s."""
+
+    def __init__(self, agent: ModelBasedAgent, logger: Logger) -> None:
+        super().__init__(agent, logger)
+        self.seconds = list[float]()
+
+    def step(self, *args: Any) -> None:
+        start = time.process_time()
+        super().step(*args)
+        self.seconds.append(time.process_time() - start)
+
+
+def logging(robot: str, args: Args) -> dict[str, float]:
+    """Times what TensorBoard takes of the control steps of an episode."""
+    agent = _agent(robot)
+    with tempfile.TemporaryDirectory() as folder:
+        logger = configure(folder, ["tensorboard"])
+        log = _TimedLog(agent, logger)
+        env = FAMLEWrapper(_make(robot), agent, log)
+        (obs, _), start = env.reset(seed=0), time.process_time()
+        for _ in range(args.steps):
+            obs, _, terminated, truncated, _ = env.step(agent.predict(obs)[0])
+            if terminated or truncated:
+                obs, _ = env.reset()
+        others = time.process_time() - start - sum(log.seconds)
+        logger.close()
+        env.env.close()
+    return {
+        "entries / other work": sum(log.seconds) / others,
+        "a step without entries (ms)": 1e3 * others / args.steps,
+        "entries, mean of all steps (ms)": 1e3 * float(np.mean(log.seconds)),
+        "longest entry (ms)": 1e3 * max(log.seconds),
+    }
+
+
+def many_robots(robot: str, args: Args) -> dict[str, float]:
+    """Times plans and adaptations of many robots at once, a robot."""
+    agent, chance, figures = _agent(robot), torch.Generator().manual_seed(0), dict[str, float]()
+    plans, adaptations = list[float](), list[float]()
+    for robots in args.batches:
+        state = _experienced(agent, robots)
+        obs, starts = state.memory.obs[:, -1], torch.zeros(robots, dtype=torch.bool)
+        plan, adapt = _medians(
+            1 if robots > 8 else args.repeats // 4,
+            partial(agent.controller.act, state, obs, starts, chance),
+            partial(agent.controller.adapter.adapt, state.memory, state.belief),
+            warm_up=0 if robots > 64 else 1,
+        )
+        plans.append(plan)
+        adaptations.append(adapt)
+        figures |= {f"B = {robots}: plan (ms a robot)": plan / robots}
+        figures |= {f"B = {robots}: adaptation (ms a robot)": adapt / robots}
+    return {
+        "plan: a robot of the most / one alone": plans[-1] / plans[0] * args.batches[0] / args.batches[-1],
+        "plan: growth with B": _growth(args.batches, plans),
+        "adaptation: growth with B": _growth(args.batches, adaptations),
+    } | figures
+
+
+def growth(robot: str, args: Args) -> dict[str, float]:
+    """Fits how the cost of a plan grows with its size, and that of taking in a transition with the memory."""
+    obs, repeats = _make(robot).reset(seed=0)[0], max(3, args.repeats // 4)
+    figures = dict[str, float]()
+    for setting, sizes in (("horizon", (5, 10, 20, 40)), ("candidates", (32, 128, 512, 2048))):
+        settings: list[dict[str, Any]] = [{setting: size} for size in sizes]
+        plans = [partial(_agent(robot, **one).predict, obs) for one in settings]
+        figures[f"plan: growth with {setting}"] = _growth(sizes, _medians(repeats, *plans))
+    memories = (100, 1000, 10_000)
+    takes = [_observe(_agent(robot, memory_size=size, adapt_every=10**6)) for size in memories]
+    figures["a transition: growth with M"] = _growth(memories, _medians(repeats, *takes))
+    return figures
+
+
+def start_up(robot: str, args: Args) -> dict[str, float]:
+    """Times a process of its own until a robot's first action, and takes its memory."""
+    program = (
+        "import json, time; start = time.process_time(); from benchmarks.performance import first_action; "
+        f"imported = time.process_time(); first_action({robot!r}); acted = time.process_time(); "
+        "memory = [line for line in open('/proc/self/status') if line.startswith('VmHWM')][0]; "
+        "print(json.dumps([imported - start, acted - imported, int(memory.split()[1])]))"
+    )
+    out = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, env=os.environ)
+    imports, acts, kilobytes = json.loads(out.stdout.splitlines()[-1])
+    return {"imports (s)": imports, "then until the first action (s)": acts, "memory (MB)": kilobytes / 1024}
+
+
+def first_action(robot: str) -> None:
+    """Makes an agent and has it act once."""
+    torch.set_num_threads(1)
+    _agent(robot).predict(_make(robot).reset(seed=0)[0])
+
+
+PARTS: Mapping[str, Callable[[str, Args], Mapping[str, float]]] = {
+    "planning": planning,
+    "adaptation": adaptation,
+    "selection": selection,
+    "training": training,
+    "environment": environment,
+    "collection": collection,
+    "control": control,
+    "logging": logging,
+    "many robots": many_robots,
+    "growth": growth,
+    "start-up": start_up,
+}
+"""What can be timed."""
+
+
+def main(args: Args) -> None:
+    """Measures, stores and prints."""
+    torch.set_num_threads(args.threads)
+    for robot in args.robots:
+        for part in args.parts:
+            with torch.no_grad() if part != "training" else torch.enable_grad():
+                figures = PARTS[part](robot, args)
+            about = {"robot": robot, "part": part, "threads": args.threads, "machine": machine()}
+            rows = [{"figure": name, "value": float(value)} | about for name, value in figures.items()]
+            store(
+                args.out / "performance.csv", [row | provenance(sys.argv) for row in rows], ("robot", "part", "threads")
+            )
+            print(
+                f"\n{robot}, {part}:", pd.Series(figures).to_string(float_format="{:.4g}".format), sep="\n", flush=True
+            )
+
+
+def machine() -> str:
+    """Names the processor and how many of its cores there are."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    except OSError:
+        names = []
+    return f"{names[0] if names else platform.processor() or platform.machine()}, {os.cpu_count()} cores"
+
+
+# --- how it is timed --------------------------------------------------------------------------------------------------
+
+
+def _medians(repeats: int, *calls: Callable[[], object], warm_up: int = 2) -> list[float]:
+    """Returns the median milliseconds of calls that take turns; the first turns only warm up."""
+    seconds = np.zeros((max(1, repeats) + warm_up, len(calls)))
+    for turn in range(len(seconds)):
+        for i, call in enumerate(calls):
+            start = time.process_time()
+            call()
+            seconds[turn, i] = time.process_time() - start
+    return [float(median) for median in 1e3 * np.median(seconds[warm_up:], axis=0)]
+
+
+def _growth(sizes: Sequence[int], milliseconds: Sequence[float]) -> float:
+    """Fits the slope of the logarithms; NaN of a single size."""
+    return float(np.polyfit(np.log(sizes), np.log(milliseconds), 1)[0]) if len(sizes) > 1 else float("nan")
+
+
+def _repeat(times: int, call: Callable[[], object]) -> None:
+    for _ in range(times):
+        call()
+
+
+def _sizes(model: Dynamics) -> list[int]:
+    """The widths of a model's layers, from inputs to outputs."""
+    return [model.n_features + model.action_dim, *model.network.hidden, model.obs_dim]
+
+
+def _products(model: Dynamics, networks: int, rows: int, backward: bool = False) -> Callable[[], None]:
+    """Makes the matrix products of a step through a number of networks; with ``backward`` those of gradients, too."""
+    layers = [
+        (torch.randn(networks, rows, a), torch.randn(networks, a, b), torch.randn(networks, rows, b))
+        for a, b in pairwise(_sizes(model))
+    ]
+
+    def step() -> None:
+        for x, weight, out in layers:
+            torch.bmm(x, weight, out=out)
+            if backward:
+                torch.bmm(x.transpose(1, 2), out)  # to the weights
+                torch.bmm(out, weight.transpose(1, 2))  # to the inputs
+
+    return step
+
+
+def _make(robot: str, engine: str = Task.engine) -> gym.Env[Any, Any]:
+    env = gym.make(known_robots()[robot].env_id, engine=engine)
+    env.reset(seed=0)
+    return env
+
+
+def _agent(robot: str, mode: str = "ours", situations: int = _SITUATIONS, **settings: Any) -> FAMLE:
+    """Makes an agent with an untrained model."""
+    agent = FAMLE(_make(robot), mode, seed=0, device="cpu", pretrained=False, **settings)
+    model = agent.policy.builder.dynamics(situations)
+    agent.policy.world = WorldModel(model, tuple(f"situation {i}" for i in range(situations)))
+    return agent
+
+
+def _experienced(agent: FAMLE, robots: int) -> OnlineState:
+    """Makes the state of robots whose memory is full."""
+    state, chance = agent.policy.initial(robots), torch.Generator().manual_seed(0)
+
+    def some(like: Tensor) -> Tensor:
+        return 0.1 * torch.randn(like.shape, generator=chance)
+
+    old = state.memory
+    memory = replace(
+        old,
+        obs=some(old.obs),
+        action=some(old.action),
+        next_obs=some(old.next_obs),
+        weight=torch.ones_like(old.weight),
+    )
+    return replace(state, memory=memory, last=(memory.obs[:, -1], memory.action[:, -1]))
+
+
+def _observe(agent: FAMLE) -> Callable[[], object]:
+    """Has a robot take in a transition: judged by each candidate, remembered, and the posterior updated."""
+    state = _experienced(agent, 1)
+    obs, goes_on = state.memory.obs[:, -1], torch.zeros(1, dtype=torch.bool)
+    return partial(torch.no_grad()(agent.controller.observe), state, obs, goes_on)
+
+
+if __name__ == "__main__":
+    launch(main, Args)
