@@ -74,7 +74,7 @@ class Args:
     """B, robots at once."""
     embeddings: tuple[int, ...] = (10, 100, 1000, 10_000)
     """N, embeddings to select from; with the sums of two where these are at most 50,000."""
-    transitions: int = 2000
+    transitions: int = 500
     """Transitions that a process collects by chance; a fiftieth of them while planning."""
     threads: int = 1
     """Threads of torch."""

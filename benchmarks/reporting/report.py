@@ -22,7 +22,7 @@ from famle_agent.utils.atomic_write import whole_file
 
 _WIDTH = 180
 _SINE = "Sines from three, four and five points (figure 2)", "sine", "python -m benchmarks.sine"
-_NO_EXPERIMENTS = {"sine", "timing", "identification", "prediction", "robustness"}
+_NO_EXPERIMENTS = {"sine", "performance", "timing", "identification", "prediction", "robustness"}
 """Tables that the registry does not have."""
 
 
