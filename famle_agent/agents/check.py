@@ -37,7 +37,7 @@ class Check:
         nothing: Of actions that are 0, or the nearest to it, (n,).
         random: Of actions at random, (n,).
         errors: Of the agent's predictions in the end, see :attr:`~famle_agent.adaptation.belief.Belief.errors`, (n,).
-        steps: How long an episode lasted at most.
+        steps: How long the longest episode lasted.
     """
 
     situations: tuple[str, ...]
@@ -83,21 +83,27 @@ def check_plans(agent: Plans, envs: SituationEnvs, seed: int, steps: int = 200, 
         return np.asarray(action)
 
     try:
-        planned = _returns(made, plan, seed, steps)
-        nothing = _returns(made, lambda obs: np.broadcast_to(np.clip(0.0, space.low, space.high), shape), seed, steps)
-        random = _returns(made, lambda obs: rng.uniform(space.low, space.high, shape), seed, steps)
+        actors: list[Callable[[Array], Array]] = [
+            plan,
+            lambda obs: np.broadcast_to(np.clip(0.0, space.low, space.high), shape),
+            lambda obs: rng.uniform(space.low, space.high, shape),
+        ]
+        (planned, nothing, random), lasted = zip(*(_returns(made, act, seed, steps) for act in actors), strict=True)
     finally:
         for env, source in zip(made, sources, strict=True):
             if env is not source:
                 env.close()
-    return Check(tuple(envs.situations[i] for i in chosen), planned, nothing, random, errors, steps)
+    return Check(tuple(envs.situations[i] for i in chosen), planned, nothing, random, errors, max(lasted))
 
 
-def _returns(envs: Sequence[gym.Env[Any, Any]], act: Callable[[Array], Array], seed: int, steps: int) -> Array:
-    """The return of one episode in each environment, (n,); one that has ended waits for the others."""
+def _returns(
+    envs: Sequence[gym.Env[Any, Any]], act: Callable[[Array], Array], seed: int, steps: int
+) -> tuple[Array, int]:
+    """Returns what one episode in each environment yields, (n,), and the steps of the longest; the others wait."""
     obs = np.stack([gate.reset(env, seed=seed)[0] for env in envs]).astype(np.float32)
-    total, lives = np.zeros(len(envs)), np.ones(len(envs), dtype=bool)
-    for _ in range(steps):
+    total, lives, lasted = np.zeros(len(envs)), np.ones(len(envs), dtype=bool), 0
+    while lasted < steps and lives.any():
+        lasted += 1
         actions = act(obs).astype(envs[0].action_space.dtype)
         for i, env in enumerate(envs):
             if not lives[i]:
@@ -106,6 +112,4 @@ def _returns(envs: Sequence[gym.Env[Any, Any]], act: Callable[[Array], Array], s
             obs[i] = step.obs
             total[i] += step.reward
             lives[i] = not (step.terminated or step.truncated)
-        if not lives.any():
-            break
-    return total
+    return total, lasted
