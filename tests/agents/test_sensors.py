@@ -196,6 +196,7 @@ def drive(agent: ModelBasedAgent, robot: Cart, steps: int, door: str) -> OnlineS
     """Drives a robot with an agent; what it believes in the end."""
     if door == "learn":
         agent.set_env(robot)
+        agent.set_random_seed(0)
         agent.learn(steps)
         return agent.state_of(1)
     env = FAMLEWrapper(robot, agent) if door == "wrapper" else robot
