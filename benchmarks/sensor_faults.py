@@ -193,7 +193,7 @@ def drive(agent: FAMLE, robot: str, fault: str, steps: int, seed: int) -> Result
 
 def _is_finite(agent: FAMLE) -> bool:
     belief = agent.belief
-    numbers = [*belief.theta.values(), belief.h, belief.log_posterior, belief.excess]
+    numbers = [*belief.theta.values(), belief.h, belief.log_posterior, belief.bias, belief.excess]
     return all(bool(values.isfinite().all()) for values in numbers)
 
 

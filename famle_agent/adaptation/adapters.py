@@ -157,7 +157,7 @@ class GradientAdapter:
     def judge(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> Evidence:
         """Returns zeros: there is one model, and nothing to tell apart."""
         nothing = obs.new_zeros(len(obs), 1)
-        return Evidence(nothing, nothing, nothing[:, 0])
+        return Evidence(torch.zeros_like(belief.bias), nothing, nothing[:, 0])
 
     def infer(self, memory: Memory, belief: Belief, evidence: Evidence, moved: Tensor) -> Belief:
         """Returns the belief as it is."""
