@@ -11,18 +11,15 @@ growth in proportion.
 
 from __future__ import annotations
 
-import copy
 import json
 import os
-import platform
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +28,12 @@ import numpy as np
 import pandas as pd
 import torch
 from stable_baselines3.common.logger import Logger, configure
-from torch import Tensor, nn
+from torch import Tensor
 
+from benchmarks.raw_cost import OneByOne, bare_products
 from benchmarks.results import provenance, store
 from benchmarks.runner import launch
+from benchmarks.stopwatch import growth_of, machine, medians, repeat
 from benchmarks.task import Task
 from famle_agent import FAMLE, AdaptationLog, FAMLEWrapper, ModelBasedAgent
 from famle_agent.adaptation.controller import OnlineState
@@ -42,7 +41,7 @@ from famle_agent.agents.presets import known_robots
 from famle_agent.agents.world_model import WorldModel
 from famle_agent.data.collect import collect
 from famle_agent.data.policies import MakePolicy, make_held_uniform
-from famle_agent.models.dynamics import Batch, Dynamics
+from famle_agent.models.dynamics import Batch
 from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.training.reptile import Reptile
 from famle_envs.engines import ENGINES
@@ -98,9 +97,9 @@ def planning(robot: str, args: Args) -> dict[str, float]:
         planner, model = agent.config.planner, agent.policy.model
         # Bare products are fastest where what they work on stays in the processor's cache.
         parts = -(-planner.candidates // _ROWS_IN_CACHE)
-        products = _products(model, model.members, planner.candidates // parts)
+        products = bare_products(model, model.members, planner.candidates // parts)
         steps = parts * planner.horizon * getattr(planner, "iterations", 1)
-        plan, bare = _medians(max(3, args.repeats // 4), partial(agent.predict, obs), partial(_repeat, steps, products))
+        plan, bare = medians(max(3, args.repeats // 4), partial(agent.predict, obs), partial(repeat, steps, products))
         ratios[f"{mode}: plan / bare products"] = plan / bare
         times |= {f"{mode}: plan (ms)": plan, f"{mode}: bare products (ms)": bare}
     return ratios | times
@@ -111,14 +110,14 @@ def adaptation(robot: str, args: Args) -> dict[str, float]:
     agent = _agent(robot)
     adapter, state, how = agent.controller.adapter, _experienced(agent, 1), agent.config.adaptation.gradient
     if how is None:
-        (adapt,) = _medians(args.repeats, partial(adapter.adapt, state.memory, state.belief))
+        (adapt,) = medians(args.repeats, partial(adapter.adapt, state.memory, state.belief))
         return {"adaptation (ms)": adapt}
     model, k = agent.policy.model, how.inner_loop(state.memory.seen).steps
-    products = _products(model, model.members, how.batch_size or state.memory.seen, backward=True)
-    adapt, bare = _medians(
+    products = bare_products(model, model.members, how.batch_size or state.memory.seen, backward=True)
+    adapt, bare = medians(
         max(3, args.repeats // 4),
         partial(adapter.adapt, state.memory, state.belief),
-        partial(_repeat, k, products),
+        partial(repeat, k, products),
     )
     return {
         "adaptation / bare products": adapt / bare,
@@ -139,10 +138,10 @@ def selection(robot: str, args: Args) -> dict[str, float]:
                 continue
             observe = _observe(_agent(robot, situations=n, compose=compose, adapt_every=10**6))
             sizes.append(n)
-            milliseconds += _medians(max(3, args.repeats // 4), observe)
+            milliseconds += medians(max(3, args.repeats // 4), observe)
         name = "embeddings and their sums" if compose else "embeddings"
         figures |= {f"{name}: N = {n} (ms)": ms for n, ms in zip(sizes, milliseconds, strict=True)}
-        figures[f"{name}: growth with N"] = _growth(sizes, milliseconds)
+        figures[f"{name}: growth with N"] = growth_of(sizes, milliseconds)
     return figures
 
 
@@ -155,12 +154,12 @@ def training(robot: str, args: Args) -> dict[str, float]:
     batch = Batch(x, y.expand(_SITUATIONS, data, -1).contiguous(), torch.ones(_SITUATIONS, data))
     chance = torch.Generator().manual_seed(0)
     ours = Reptile(10**6, meta_batch_size=_SITUATIONS, batch_size=size).steps(model, batch, InnerLoop(k), chance)
-    products = _products(model, _SITUATIONS, size, backward=True)
-    meta, one_by_one, bare = _medians(
+    products = bare_products(model, _SITUATIONS, size, backward=True)
+    meta, one_by_one, bare = medians(
         max(3, args.repeats // 4),
         partial(next, ours),
         OneByOne(model, batch, InnerLoop(k), size).situation,
-        partial(_repeat, k, products),
+        partial(repeat, k, products),
     )
     step, port, raw = meta / (k * _SITUATIONS), one_by_one / k, bare / (k * _SITUATIONS)
     return {
@@ -172,43 +171,6 @@ def training(robot: str, args: Args) -> dict[str, float]:
     }
 
 
-class OneByOne:
-    """Algorithm 1 as it is written: one situation after the other, with PyTorch's own layers.
-
-    Args:
-        model: Says how large the network is.
-        data: Transitions of N situations.
-        inner_loop: U^k.
-        batch_size: Transitions per step.
-    """
-
-    def __init__(self, model: Dynamics, data: Batch, inner_loop: InnerLoop, batch_size: int) -> None:
-        E, sizes = model.embeddings.shape[-1], _sizes(model)
-        sizes = [sizes[0] + E, *sizes[1:]]
-        layers = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b, dtype=torch.float32), nn.SiLU())]
-        self.theta, self.H = nn.Sequential(*layers[:-1]), torch.randn(len(data.x), E)
-        self.data, self.inner_loop, self.batch_size, self.iteration = data, inner_loop, batch_size, 0
-
-    def situation(self) -> None:
-        """Runs lines 10 to 13 for the next situation."""
-        c = self.iteration % len(self.H)
-        theta, h = copy.deepcopy(self.theta), self.H[c].clone().requires_grad_()
-        groups = [{"params": [*theta.parameters()], "lr": self.inner_loop.lr}, {"params": [h], "lr": 1e-2}]
-        optimizer = torch.optim.SGD(groups)
-        for _ in range(self.inner_loop.steps):
-            i = torch.randint(self.data.x.shape[1], (self.batch_size,))
-            predicted = theta(torch.cat([self.data.x[c, i], h.expand(self.batch_size, -1)], dim=1))
-            loss = nn.functional.mse_loss(predicted, self.data.y[c, i])
-            optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            optimizer.step()
-        with torch.no_grad():
-            for mine, adapted in zip(self.theta.parameters(), theta.parameters(), strict=True):
-                mine.lerp_(adapted, 0.5)
-            self.H[c] = self.H[c].lerp(h, 0.5)
-        self.iteration += 1
-
-
 def environment(robot: str, args: Args) -> dict[str, float]:
     """Times a step of the environment in each engine against the bare physics, and a second of its own time."""
     ratios, times = dict[str, float](), dict[str, float]()
@@ -216,7 +178,7 @@ def environment(robot: str, args: Args) -> dict[str, float]:
         env: Any = _make(robot, engine=engine).unwrapped
         action = np.full(env.action_space.shape, 0.3)
         bare = partial(env.world.simulate, env.physics_steps)
-        step, raw = _medians(5 * args.repeats, partial(env.step, action), bare)
+        step, raw = medians(5 * args.repeats, partial(env.step, action), bare)
         times |= {f"{engine}: step (ms)": step, f"{engine}: bare physics (ms)": raw}
         times[f"{engine}: simulated second (ms)"] = step / env.control_period
         ratios[f"{engine}: step / bare physics"] = step / raw
@@ -314,7 +276,7 @@ def many_robots(robot: str, args: Args) -> dict[str, float]:
     for robots in args.batches:
         state = _experienced(agent, robots)
         obs, starts = state.memory.obs[:, -1], torch.zeros(robots, dtype=torch.bool)
-        plan, adapt = _medians(
+        plan, adapt = medians(
             1 if robots > 8 else args.repeats // 4,
             partial(agent.controller.act, state, obs, starts, chance),
             partial(agent.controller.adapter.adapt, state.memory, state.belief),
@@ -326,8 +288,8 @@ def many_robots(robot: str, args: Args) -> dict[str, float]:
         figures |= {f"B = {robots}: adaptation (ms a robot)": adapt / robots}
     return {
         "plan: a robot of the most / one alone": plans[-1] / plans[0] * args.batches[0] / args.batches[-1],
-        "plan: growth with B": _growth(args.batches, plans),
-        "adaptation: growth with B": _growth(args.batches, adaptations),
+        "plan: growth with B": growth_of(args.batches, plans),
+        "adaptation: growth with B": growth_of(args.batches, adaptations),
     } | figures
 
 
@@ -338,10 +300,10 @@ def growth(robot: str, args: Args) -> dict[str, float]:
     for setting, sizes in (("horizon", (5, 10, 20, 40)), ("candidates", (32, 128, 512, 2048))):
         settings: list[dict[str, Any]] = [{setting: size} for size in sizes]
         plans = [partial(_agent(robot, **one).predict, obs) for one in settings]
-        figures[f"plan: growth with {setting}"] = _growth(sizes, _medians(repeats, *plans))
+        figures[f"plan: growth with {setting}"] = growth_of(sizes, medians(repeats, *plans))
     memories = (100, 1000, 10_000)
     takes = [_observe(_agent(robot, memory_size=size, adapt_every=10**6)) for size in memories]
-    figures["a transition: growth with M"] = _growth(memories, _medians(repeats, *takes))
+    figures["a transition: growth with M"] = growth_of(memories, medians(repeats, *takes))
     return figures
 
 
@@ -397,60 +359,7 @@ def main(args: Args) -> None:
             )
 
 
-def machine() -> str:
-    """Names the processor and how many of its cores there are."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    except OSError:
-        names = []
-    return f"{names[0] if names else platform.processor() or platform.machine()}, {os.cpu_count()} cores"
-
-
-# --- how it is timed --------------------------------------------------------------------------------------------------
-
-
-def _medians(repeats: int, *calls: Callable[[], object], warm_up: int = 2) -> list[float]:
-    """Returns the median milliseconds of calls that take turns; the first turns only warm up."""
-    seconds = np.zeros((max(1, repeats) + warm_up, len(calls)))
-    for turn in range(len(seconds)):
-        for i, call in enumerate(calls):
-            start = time.process_time()
-            call()
-            seconds[turn, i] = time.process_time() - start
-    return [float(median) for median in 1e3 * np.median(seconds[warm_up:], axis=0)]
-
-
-def _growth(sizes: Sequence[int], milliseconds: Sequence[float]) -> float:
-    """Fits the slope of the logarithms; NaN of a single size."""
-    return float(np.polyfit(np.log(sizes), np.log(milliseconds), 1)[0]) if len(sizes) > 1 else float("nan")
-
-
-def _repeat(times: int, call: Callable[[], object]) -> None:
-    for _ in range(times):
-        call()
-
-
-def _sizes(model: Dynamics) -> list[int]:
-    """The widths of a model's layers, from inputs to outputs."""
-    return [model.n_features + model.action_dim, *model.network.hidden, model.obs_dim]
-
-
-def _products(model: Dynamics, networks: int, rows: int, backward: bool = False) -> Callable[[], None]:
-    """Makes the matrix products of a step through a number of networks; with ``backward`` those of gradients, too."""
-    layers = [
-        (torch.randn(networks, rows, a), torch.randn(networks, a, b), torch.randn(networks, rows, b))
-        for a, b in pairwise(_sizes(model))
-    ]
-
-    def step() -> None:
-        for x, weight, out in layers:
-            torch.bmm(x, weight, out=out)
-            if backward:
-                torch.bmm(x.transpose(1, 2), out)  # to the weights
-                torch.bmm(out, weight.transpose(1, 2))  # to the inputs
-
-    return step
+# --- what it is timed on ----------------------------------------------------------------------------------------------
 
 
 def _make(robot: str, engine: str = Task.engine) -> gym.Env[Any, Any]:

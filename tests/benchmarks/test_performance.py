@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.performance import PARTS, Args, OneByOne, main
+from benchmarks.performance import PARTS, Args, main
+from benchmarks.raw_cost import OneByOne
 from benchmarks.results import load
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
