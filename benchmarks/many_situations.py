@@ -23,7 +23,7 @@ import torch
 from benchmarks.methods import from_cache
 from benchmarks.results import Result, load
 from benchmarks.runner import Batch, Options, launch, run_batches
-from famle_agent import FAMLE, FAMLEWrapper
+from famle_agent import FAMLE, FAMLEWrapper, ModelBasedAgent
 from famle_envs import Situation
 from famle_envs.reacher import ReacherEnv
 
@@ -100,7 +100,7 @@ def live(name: str, replicates: int, cache: Path) -> list[Result]:
     return results
 
 
-def episode(env: FAMLEWrapper, agent: FAMLE, seed: int) -> float:
+def episode(env: FAMLEWrapper, agent: ModelBasedAgent, seed: int) -> float:
     """Lives one episode; returns its return."""
     (obs, _), total, ended = env.reset(seed=seed), 0.0, False
     while not ended:
