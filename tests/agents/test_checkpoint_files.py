@@ -3,7 +3,6 @@ from __future__ import annotations
 import io
 import json
 import sys
-import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -192,10 +191,8 @@ def test_file_cannot_ask_for_a_network_that_it_does_not_hold(
     agent_file: Path, tmp_path: Path, settings: dict[str, Any]
 ) -> None:
     path = rewrite(agent_file, tmp_path / "odd.zip", lambda meta: meta["hyperparameters"].update(settings))
-    start = time.perf_counter()
-    with pytest.raises(ValueError, match="do not fit"):
+    with pytest.raises(ValueError, match="do not fit"):  # which no memory would be enough to find out by making it
         FAMLE.load(path, device="cpu")
-    assert time.perf_counter() - start < 10.0  # the largest one, were it made, would not end
 
 
 @pytest.mark.parametrize("name", ["h", "plan", "memory.obs", "theta.weight_0", "candidate"])
