@@ -66,8 +66,8 @@ class Bed:
     test: Mapping[str, Make]
 
 
-def motors(env_id: str, steps: int, train: tuple[str, ...], test: tuple[str, ...], **kwargs: Any) -> Bed:
-    """Describes a bed of broken motors."""
+def faults_of(env_id: str, steps: int, train: tuple[str, ...], test: tuple[str, ...], **kwargs: Any) -> Bed:
+    """Describes a bed of faults by their names."""
     make = {name: partial(faulty, env_id, name, steps, **kwargs) for name in ("intact", *train, *test)}
     return Bed({name: make[name] for name in ("intact", *train)}, {name: make[name] for name in test})
 
@@ -85,21 +85,30 @@ def pendulum() -> Bed:
     return Bed(train, {f"mass {m}, length {x}": partial(Hanging, m, x) for m, x in unseen})
 
 
+def masses_and_dampings() -> Bed:
+    """Describes CaDM's half cheetah: mass and damping out of range, and the intact robot to compare with."""
+    train = [f"mass x {m}, damping x {d}" for m, d in product((1.0, 0.75, 0.85, 1.15, 1.25), repeat=2)]
+    test = [f"mass x {x}, damping x {x}" for x in (0.25, 0.45, 1.55, 1.75)]
+    bed = faults_of("HalfCheetah-v5", 500, tuple(train[1:]), tuple(test))  # the first is the intact robot
+    return Bed(bed.train, {"intact": bed.train["intact"], **bed.test})
+
+
 BEDS: Mapping[str, Callable[[], Bed]] = {
-    "halfcheetah": lambda: motors(
+    "halfcheetah": lambda: faults_of(
         "HalfCheetah-v5",
         500,
         every_motor(4, "dead"),
         ("motor 4 dead", "motor 5 dead", "motor 0 dead, motor 4 dead", "motor 1 dead, motor 3 dead"),
     ),
-    "ant": lambda: motors(
+    "halfcheetah-body": masses_and_dampings,
+    "ant": lambda: faults_of(
         "Ant-v5",
         500,
         tuple(f"motor {2 * i} dead, motor {2 * i + 1} dead" for i in range(3)),
         ("motor 6 dead, motor 7 dead",),
         include_cfrc_ext_in_observation=False,
     ),
-    "invertedpendulum": lambda: motors(
+    "invertedpendulum": lambda: faults_of(
         "InvertedPendulum-v5",
         1000,
         (*(f"motor 0 strength x {f}, body 1 mass x {m}" for f in (0.5, 1.5) for m in (0.8, 1.2)), "motor 0 reversed"),
@@ -110,7 +119,7 @@ BEDS: Mapping[str, Callable[[], Bed]] = {
         ),
     ),
     "pendulum": pendulum,
-    "pusher": lambda: motors(
+    "pusher": lambda: faults_of(
         "Pusher-v5",
         100,
         every_motor(7, "dead") + every_motor(7, "reversed"),
@@ -120,19 +129,19 @@ BEDS: Mapping[str, Callable[[], Bed]] = {
             "motor 0 reversed, motor 3 reversed",
         ),
     ),
-    "reacher": lambda: motors(
+    "reacher": lambda: faults_of(
         "Reacher-v5",
         50,
         every_motor(2, "dead") + every_motor(2, "reversed"),
         ("motor 0 at gain 0.3", "motor 0 reversed, motor 1 reversed", "motor 0 at gain -0.5, motor 1 at gain 0.5"),
     ),
-    "hopper": lambda: motors(
+    "hopper": lambda: faults_of(
         "Hopper-v5",
         500,
         every_motor(3, "at gain 0.5") + every_motor(3, "dead"),
         ("motor 0 at gain 0.3", "motor 1 at gain 0.3", "motor 2 at gain 0.3"),
     ),
-    "walker2d": lambda: motors(
+    "walker2d": lambda: faults_of(
         "Walker2d-v5",
         500,
         every_motor(6, "dead"),
