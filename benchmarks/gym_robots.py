@@ -172,6 +172,8 @@ class Args(Options):
     """What is compared; FAMLE first, whose meta-training the others share."""
     seeds: int = 3
     """Independent meta-trainings."""
+    lives: int = 3
+    """First episodes of each unseen robot, which begin from different places."""
     change: tuple[str, ...] = ()
     """Settings of FAMLE to change, such as policy_steps=100000; the table gets them into its name."""
 
@@ -287,26 +289,30 @@ def episode(env: Env, actor: Actor, seed: int) -> tuple[float, list[float]]:
     return total, seconds
 
 
-def run(method: str, name: str, seed: int, cache: Path, change: tuple[str, ...]) -> list[Result]:
+def run(method: str, name: str, seed: int, lives: int, cache: Path, change: tuple[str, ...]) -> list[Result]:
     """Runs a method of one meta-training on all unseen robots."""
     known, start = is_learnt(method, name, seed, cache, change), time.process_time()
     actor = actor_of(method, name, seed, cache, change)
     learning = None if known else time.process_time() - start
-    returns, steps, choosing = dict[str, float](), dict[str, int](), list[float]()
-    for robot, make in BEDS[name]().test.items():
-        returns[robot], seconds = episode(make(), actor, 1000 + seed)
-        steps[robot] = len(seconds)
+    test, choosing = BEDS[name]().test, list[float]()
+    returns, steps = {robot: list[float]() for robot in test}, {robot: list[int]() for robot in test}
+    for (robot, make), life in product(test.items(), range(lives)):
+        total, seconds = episode(make(), actor, 1000 + seed + 100 * life)
+        returns[robot].append(total)
+        steps[robot].append(len(seconds))
         choosing += seconds
     milliseconds = 1e3 * float(np.median(choosing))
     return [{"cpu_seconds": learning, "returns": returns, "steps": steps, "ms_per_step": milliseconds}]
 
 
 def summary(results: pd.DataFrame) -> pd.DataFrame:
-    """Takes median, worst and best over meta-trainings and unseen robots, and the median of each robot."""
-    returns = pd.DataFrame(list(results["returns"]), index=results["method"])
-    methods = [method for method in (*METHODS, *LONG) if method in returns.index]
-    over_all = returns.stack().groupby(level=0).agg(["median", "min", "max"])
-    return over_all.join(returns.groupby(level=0).median()).loc[methods]
+    """Takes median, worst and best over meta-trainings, unseen robots and lives, and the median of each robot."""
+    table = pd.DataFrame(list(results["returns"]), index=results["method"])
+    returns = table.stack().explode().astype(float)  # by method and robot
+    methods = [method for method in (*METHODS, *LONG) if method in table.index]
+    over_all = returns.groupby(level=0).agg(["median", "min", "max"])
+    of_each = returns.groupby(level=[0, 1]).median().unstack()[table.columns]
+    return over_all.join(of_each).loc[methods]
 
 
 def main(args: Args) -> None:
@@ -315,7 +321,7 @@ def main(args: Args) -> None:
         table = args.out / f"gym-{'-'.join((name, *args.change))}.csv"
         for method in args.methods:
             batches = [
-                Batch(method, (seed,), partial(run, method, name, seed, args.cache, args.change))
+                Batch(method, (seed,), partial(run, method, name, seed, args.lives, args.cache, args.change))
                 for seed in range(args.seeds)
             ]
             run_batches(batches, table, args.jobs, args.backend)

@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
 
 from benchmarks import gym_robots
@@ -24,24 +25,32 @@ def small_bed() -> Bed:
 
 
 @pytest.mark.usefixtures("tiny_budgets")
-def test_every_method_lives_one_episode_on_each_unseen_robot(
+def test_every_method_lives_on_each_unseen_robot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(gym_robots, "BEDS", {"small": small_bed})
-    args = Args(beds=("small",), seeds=1, jobs=1, out=tmp_path / "out", cache=tmp_path / "cache")
+    args = Args(beds=("small",), seeds=1, lives=2, jobs=1, out=tmp_path / "out", cache=tmp_path / "cache")
     main(args)
     results = load(tmp_path / "out" / "gym-small.csv")
     assert set(results["method"]) == set(METHODS)
     for row in results.to_dict("records"):
         assert set(row["returns"]) == {"motor 0 dead"}
-        assert row["steps"] == {"motor 0 dead": STEPS}
-        assert np.isfinite(row["returns"]["motor 0 dead"])
+        assert row["steps"] == {"motor 0 dead": [STEPS, STEPS]}
+        first, second = row["returns"]["motor 0 dead"]
+        assert np.isfinite([first, second]).all()
+        assert first != second
     assert {path.name for path in (tmp_path / "cache").iterdir()} == {
         f"gym-small-{kind}-0.zip" for kind in ("FAMLE", "AMPC", "AMPCMAML")
     }
     shown = capsys.readouterr().out
     assert all(method in shown for method in METHODS)
     main(args)  # which has nothing left to do
+
+
+def test_summary_is_over_meta_trainings_robots_and_lives() -> None:
+    returns = [{"a": [1.0, 2.0], "b": [9.0, 4.0]}, {"a": [3.0, 3.0], "b": [8.0, 5.0]}]
+    found = summary(pd.DataFrame({"method": ["famle", "famle"], "returns": returns})).loc["famle"]
+    assert found.to_dict() == {"median": 3.5, "min": 1.0, "max": 9.0, "a": 2.5, "b": 6.5}
 
 
 def test_manual_quotes_the_stored_results() -> None:
