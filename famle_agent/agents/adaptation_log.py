@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -17,13 +17,12 @@ from torch import Tensor
 
 from famle_agent.adaptation.controller import OnlineState
 from famle_agent.adaptation.perception import senses_of
-from famle_agent.agents.held_out import Experience, Models, Step, Window
+from famle_agent.agents.held_out import Models, Step, Window
+from famle_agent.agents.online_adaptation import Experience
 from famle_agent.agents.pictures import Array, Path, draw_paths, draw_posterior, liveliest
+from famle_agent.agents.policy import AdaptivePolicy
 from famle_agent.agents.tensorboard import log_embeddings, log_settings, log_values, picture, scalar, shows, text
 from famle_agent.utils.allowance import Allowance
-
-if TYPE_CHECKING:
-    from famle_agent.agents.agent import ModelBasedAgent
 
 __all__ = ["AdaptationLog", "belief_scalars", "log_belief"]
 
@@ -32,6 +31,43 @@ _STEPS = 10  # between two entries of an agent that never adapts while an episod
 _MOMENTS = 1000  # of the picture of the posterior
 _PATHS = 20  # of the picture of what was predicted
 _METRICS = ("episode/return_so_far", "prediction/error_after", "rollout/ep_rew_mean")
+
+
+class LoggedAgent(Protocol):
+    """An agent, as far as its log knows it.
+
+    Attributes:
+        mode: The settings that it began with.
+        seed: Of its chance.
+    """
+
+    mode: str
+    seed: int | None
+
+    @property
+    def policy(self) -> AdaptivePolicy:
+        """Its settings, and what it has learnt."""
+
+    @property
+    def situations(self) -> Sequence[str]:
+        """What the training situations are called."""
+
+    @property
+    def overruns(self) -> int:
+        """How often planning took too long."""
+
+    @property
+    def cut_short(self) -> int:
+        """How often the planner left out iterations."""
+
+    def posterior(self, state: OnlineState | None = None) -> dict[str, float]:
+        """Says how likely each situation is by name; without a state, as far as the agent knows now."""
+
+    def marginals(self, state: OnlineState) -> dict[str, float]:
+        """Says how likely each training situation is, alone or as a part."""
+
+    def diagnose(self, state: OnlineState) -> object:
+        """Says in words what is most likely wrong."""
 
 
 class AdaptationLog:
@@ -53,7 +89,7 @@ class AdaptationLog:
 
     def __init__(
         self,
-        agent: ModelBasedAgent,
+        agent: LoggedAgent,
         logger: Logger,
         steps: int = 0,
         share: float = 0.01,
@@ -98,17 +134,18 @@ class AdaptationLog:
             self._write_pictures()
 
     def _begin_run(self) -> None:
-        agent, model = self._agent, self._agent.model
-        settings = {"agent": type(agent).__name__, "mode": agent.mode, "seed": agent.seed, **agent.config.to_dict()}
+        agent, model, config = self._agent, self._agent.policy.model, self._agent.policy.config
+        settings = {"agent": type(agent).__name__, "mode": agent.mode, "seed": agent.seed, **config.to_dict()}
         log_settings(self._logger, settings, _METRICS, self._steps)
         if model.n_situations > 1:
             log_embeddings(self._logger, model.embeddings[0], agent.situations, self._steps)
 
     def _notice(self, newest: Experience, obs: Tensor, action: Tensor) -> None:
-        self._newest, self._models = newest, self._models or Models.of(self._agent, newest.before)
+        policy = self._agent.policy
+        self._newest, self._models = newest, self._models or Models.of(policy, newest.before)
         self._window.append(Step.of(newest, obs, action))
         self._posteriors.append((self._steps, newest.after.belief.log_posterior[0]))
-        due = newest.adapted if self._agent.config.adaptation.every else len(self._window) >= _STEPS
+        due = newest.adapted if policy.config.adaptation.every else len(self._window) >= _STEPS
         if due and self._allowance.is_left():
             with self._allowance.spending():
                 self._write_numbers(newest)
@@ -118,17 +155,17 @@ class AdaptationLog:
 
     @torch.no_grad()
     def _write_numbers(self, newest: Experience) -> None:
-        agent = self._agent
+        agent, policy = self._agent, self._agent.policy
         numbers = {**belief_scalars(agent, newest.after), **_milliseconds(self._window)}
         numbers["step/reward"] = float(np.mean(self._rewards))
         numbers["episode/return_so_far"] = self._return
         if self._models is not None:
             window = Window.of(self._window)
-            numbers |= self._models.errors(agent.model, window)
-            if path := self._models.path(window, agent.config.planner.horizon, self._steps):
+            numbers |= self._models.errors(policy.model, window)
+            if path := self._models.path(window, policy.config.planner.horizon, self._steps):
                 self._paths.append(path)
             if newest.adapted:
-                self._models = self._models.adapted(agent, newest)
+                self._models = self._models.adapted(policy, newest)
         values = [scalar(tag, value) for tag, value in numbers.items()]
         if (diagnosis := str(agent.diagnose(newest.after))) != self._diagnosis:
             self._diagnosis = diagnosis
@@ -141,13 +178,13 @@ class AdaptationLog:
         posterior = torch.stack(logits).softmax(dim=1).cpu().numpy()  # (T, C)
         drawn = [picture("posterior", draw_posterior(posterior, list(agent.posterior()), steps[0], steps[-1]))]
         if paths := list(self._paths):
-            dims = liveliest(paths, agent.model.target_std.cpu().numpy())
+            dims = liveliest(paths, agent.policy.model.target_std.cpu().numpy())
             drawn.append(picture("prediction/path", draw_paths(paths, dims)))
         log_values(self._logger, drawn, self._steps)
         self._drawn_at = self._steps
 
 
-def log_belief(agent: ModelBasedAgent, logger: Logger, state: OnlineState) -> None:
+def log_belief(agent: LoggedAgent, logger: Logger, state: OnlineState) -> None:
     """Records what an agent believes of its robots, the posterior for TensorBoard alone since it is of many situations.
 
     Arguments as of :func:`belief_scalars`.
@@ -159,7 +196,7 @@ def log_belief(agent: ModelBasedAgent, logger: Logger, state: OnlineState) -> No
         logger.record(tag, value, exclude=others)
 
 
-def belief_scalars(agent: ModelBasedAgent, state: OnlineState) -> dict[str, float]:
+def belief_scalars(agent: LoggedAgent, state: OnlineState) -> dict[str, float]:
     """Returns how likely each situation is, how often robots adapted, and what was missing or late, by tag.
 
     Args:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import time
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import replace
 from importlib.resources import as_file
 from typing import Any, ClassVar
 
@@ -18,52 +15,36 @@ import torch
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
-from stable_baselines3.common.utils import check_for_correct_spaces, configure_logger
+from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
-from tqdm.auto import tqdm
 from typing_extensions import Self
 
 from famle_agent.adaptation.adapters import EmbeddingAdapter, GradientAdapter
 from famle_agent.adaptation.belief import Belief
-from famle_agent.adaptation.controller import Adapter, Controller, OnlineState
+from famle_agent.adaptation.controller import OnlineState
 from famle_agent.adaptation.diagnosis import Diagnosis
-from famle_agent.adaptation.perception import Perception, senses_of
-from famle_agent.adaptation.senses import Senses
 from famle_agent.agents.adaptation_log import AdaptationLog, log_belief
-from famle_agent.agents.check import Check, check_plans
 from famle_agent.agents.config import Config
-from famle_agent.agents.held_out import Experience
-from famle_agent.agents.keywords import SAFETY
-from famle_agent.agents.logs import console_for_bars, log_episodes, log_time
-from famle_agent.agents.meta_training import meta_train, planning_policy, simulate
+from famle_agent.agents.logs import log_episodes, log_time
+from famle_agent.agents.meta_learning_agent import MetaLearningAgent
+from famle_agent.agents.online_adaptation import Experience, OnlineAdaptation
 from famle_agent.agents.policy import AdaptivePolicy
-from famle_agent.agents.presets import make_env, robot_of
-from famle_agent.agents.stored_agent import StoredAgent
-from famle_agent.agents.tensorboard import log_embeddings
+from famle_agent.agents.presets import Robot, make_env, robot_of
 from famle_agent.agents.world_model import Interface
 from famle_agent.data.action_scaling import to_action_space
-from famle_agent.data.description import check_spaces, env_id, env_spec, first_env, special_dims
-from famle_agent.data.envs import SituationEnvs, SituationsLike, situation_envs
-from famle_agent.data.gate import check_action, reading, vec_readings, vec_step
-from famle_agent.data.identity import identity
-from famle_agent.data.objective import other_reward, planning_reward, planning_termination
-from famle_agent.data.policies import MakePolicy, reward_names
-from famle_agent.data.probe import check_reward_fn, check_termination_fn
-from famle_agent.data.transitions import Transitions, check_names
+from famle_agent.data.description import check_spaces, env_id, env_spec, special_dims
+from famle_agent.data.gate import check_action, reading, vec_readings
 from famle_agent.data.watch import VecWatch
 from famle_agent.models.gradient_steps import prepare_torch
 from famle_agent.models.reward import RewardFn, TerminationFn
-from famle_agent.training.run_folder import RunFolder
 from famle_agent.utils.chance import alone
-from famle_agent.utils.deadline import Deadline
-from famle_agent.utils.errors import SensorError
 
 __all__ = ["ModelBasedAgent"]
 
 Array = npt.NDArray[Any]
 
 
-class ModelBasedAgent(StoredAgent):
+class ModelBasedAgent(MetaLearningAgent):
     """An agent that learns a model in simulation, adapts it on the robot, and plans with it.
 
     Args:
@@ -99,11 +80,6 @@ class ModelBasedAgent(StoredAgent):
     Attributes:
         policy: What the agent has learnt, and how it acts on it.
         num_timesteps: Steps that the agent has lived on robots.
-        num_iterations: Iterations of learning in the last meta-training.
-        overruns: How often planning took longer than ``step_budget_ms``.
-        cut_short: How often the planner left out iterations, so that it would not.
-        newest: The last step that :meth:`learn` or :meth:`observe` learnt from, and what became of it.
-        last_check: What planning was worth in simulation when it ended; None where nobody looked.
 
     Raises:
         TypeError: An override is no setting.
@@ -116,8 +92,6 @@ class ModelBasedAgent(StoredAgent):
 
     adapter_class: ClassVar[type[EmbeddingAdapter | GradientAdapter]]
     """What adapts its model; a gradient adapter has no use for more than one embedding."""
-
-    last_check: Check | None
 
     @torch.inference_mode(mode=False)
     def __init__(
@@ -170,20 +144,26 @@ class ModelBasedAgent(StoredAgent):
             given = {"angle_dims": angle_dims, "quaternion_dims": quaternion_dims, "pose_dims": pose_dims}
             dims = special_dims(self.env, given, config.model.egocentric, config.model.raw_angles)
             self.policy.robot = Interface(self.observation_space, self.action_space, dims)
-            self._take_reward(self.env)
+            self.policy.take_task(self.env)
             _ = self.policy.idle_action  # refuses a safe action that is none
         elif reward_fn is not None and not callable(reward_fn):
             raise ValueError(f"reward_fn must be a function, got {reward_fn!r}.")
         self._setup_model()
-        if pretrained and robot.pretrained is not None:
-            with as_file(robot.pretrained) as file:
-                self.policy.not_taken = self.take_model(file)
-            if mode == "ours" and self.policy.not_taken and "kind of agent" not in self.policy.not_taken:
-                warnings.warn(
-                    f"The model that is shipped for this robot is not taken: it has another "
-                    f"{', '.join(self.policy.not_taken)}. meta_learn() learns one; pretrained=False asks for none.",
-                    stacklevel=3,
-                )
+        if pretrained:
+            self._take_shipped(robot)
+
+    def _take_shipped(self, robot: Robot) -> None:
+        """Takes the model that is shipped for a robot, and warns where it does not fit but a user may expect that."""
+        if robot.pretrained is None:
+            return
+        with as_file(robot.pretrained) as file:
+            differing = self.policy.not_taken = self.take_model(file)
+        if self.mode == "ours" and differing and "kind of agent" not in differing:
+            warnings.warn(
+                f"The model that is shipped for this robot is not taken: it has another {', '.join(differing)}. "
+                "meta_learn() learns one; pretrained=False asks for none.",
+                stacklevel=4,
+            )
 
     def _preset(self, overrides: Mapping[str, Any]) -> str:
         """Under which name ``hyperparams/`` has settings that were tuned for this kind of agent; empty for FAMLE."""
@@ -201,17 +181,10 @@ class ModelBasedAgent(StoredAgent):
         return self.implied
 
     def _setup_model(self) -> None:
-        self.policy.world = self._live = None
+        self.policy.world, self._online = None, OnlineAdaptation(self.policy)
         self.num_iterations, self.last_check = 0, None
-        self._served: object = None
-        self._told: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None  # what observe() was last told
-        self._refused: OnlineState | None = None  # the state whose last observation was refused
-        self._senses: Senses | None = None  # of the robots of whom learn(), observe() and locate() were told last
+        self._wrapper: object = None  # whose robot the agent is on
         self._calls = 0  # of the environment's steps and resets when learn() last ended
-        self._plan_ms: float | None = None  # what the plan of the step that is under way took
-        self.newest: Experience | None = None
-        self._warned_of_divergence = self._warned_of_sensors = False
-        self.overruns = self.cut_short = 0
         self.generator.seed()
         self.set_random_seed(self.seed)
         if self.config.adaptation.gradient is not None:
@@ -236,183 +209,10 @@ class ModelBasedAgent(StoredAgent):
         wrapped = self._wrap_env(make_env(env), self.verbose, self._monitor_wrapper)
         check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
         self._env_spec = _description(wrapped)
-        self._take_reward(wrapped)
+        self.policy.take_task(wrapped)
         self.n_envs = wrapped.num_envs
         super().set_env(wrapped, force_reset)
         self._calls = VecWatch(wrapped).calls
-
-    def _take_reward(self, env: VecEnv) -> None:
-        """Looks for what to maximise in an environment, and for where it ends, unless the user has said it."""
-        if self.policy.user_reward_fn is None:
-            reward_fn, doubtful = planning_reward(env, self.config.planning_reward)
-            self.policy.env_reward_fn, self.policy.doubts_reward_fn = reward_fn, doubtful
-        if self.policy.user_termination_fn is None:
-            self.policy.env_termination_fn = planning_termination(env)
-        if (reward_fn := self.policy.user_reward_fn or self.policy.env_reward_fn) is not None:
-            check_reward_fn(reward_fn, self.observation_space, self.action_space, self.device)
-        if (termination_fn := self.policy.known_termination_fn) is not None:
-            check_termination_fn(termination_fn, self.observation_space, self.device)
-
-    def _require_env(self) -> VecEnv:
-        if self.env is None:
-            raise ValueError(
-                f"The agent has no environment; call set_env(env) or {type(self).__name__}.load(path, env)."
-            )
-        return self.env
-
-    def draw_seed(self) -> int:
-        """Draws a seed from the agent's generator."""
-        return int(torch.randint(2**31, (), generator=self.generator, device=self.device))
-
-    # --- what it has learnt -----------------------------------------------------------------------------
-
-    @property
-    def adapter(self) -> Adapter:
-        """What adapts the model; see :class:`~famle_agent.agents.policy.AdaptivePolicy`, here and below."""
-        return self.policy.adapter
-
-    @property
-    def controller(self) -> Controller:
-        """Algorithm 2 with the agent's adapter, planner and reward."""
-        return self.policy.controller
-
-    @property
-    def perception(self) -> Perception:
-        """The same on robots whose sensors may fail."""
-        return self.policy.perception
-
-    # --- learning in simulation -------------------------------------------------------------------------
-
-    @torch.inference_mode(mode=False)
-    def meta_learn(
-        self,
-        envs: SituationsLike | Transitions | None = None,
-        callback: MaybeCallback = None,
-        tb_log_name: str | None = None,
-        progress_bar: bool = False,
-        n_jobs: int = 1,
-        folder: str | os.PathLike[str] | None = None,
-        check: bool = True,
-    ) -> Self:
-        """Learns in simulation: collects transitions in every situation, then learns the model from them.
-
-        With ``rounds`` in the settings it goes round: the agent plans with its model in every simulated situation, and
-        learns on from all transitions. Callbacks are called once an iteration, which ``num_iterations`` counts;
-        ``num_timesteps`` counts steps of the robot and stands still.
-
-        Args:
-            envs: One environment, factory or :class:`~famle_envs.Situation` per situation, in a list or in a mapping
-                from what each is called; None takes the training situations that the agent's environment names. Or
-                :class:`Transitions` that were collected before, which are then all that is learnt from.
-                List the situation first that the robot is in until it shows otherwise.
-            callback: Stable-Baselines3 callbacks, or a function.
-            tb_log_name: Name of the run in TensorBoard; by default the class and ``_meta``.
-            progress_bar: Whether to show progress bars; with ``verbose=1``, in the place of the tables of losses.
-            n_jobs: Processes that simulate, -1 for one a core. The result does not depend on it. A policy is learnt in
-                this process alone.
-            folder: Where transitions are stored as they come, the model after each round, and once a minute how far
-                a round has got. The same call goes on where one that was stopped had got to.
-            check: Whether to let the agent plan in simulation in the end, to compare it with doing nothing and acting
-                at random, and to warn where it is not better. What its errors are there, a diagnosis takes for usual.
-                The result is in ``last_check``, in TensorBoard, and printed with ``verbose=1``.
-
-        Returns:
-            The agent.
-
-        Raises:
-            ValueError: There are no situations, or their names cannot be told apart; an environment's spaces differ
-                from the agent's; or the folder is of a run with other settings.
-        """
-        source = envs if isinstance(envs, Transitions) else self.situation_envs(envs)
-        check_names(source.situations)
-        run = RunFolder(folder, {} if folder is None else self._fingerprint(source))  # which reads all transitions
-        self._close_logger()
-        if not self._custom_logger:
-            name = tb_log_name or f"{type(self).__name__}_meta"
-            self._logger = configure_logger(self.verbose, self.tensorboard_log, name)
-        hooks = self._init_callback(callback)
-        # The name that callbacks look for.
-        total_timesteps = self.config.iterations(0 if isinstance(source, Transitions) else self.config.last_round)
-        known, self.num_iterations = self.policy.world, 0
-        self.forget()
-        if folder is not None and self.seed is not None:
-            self.generator.manual_seed(self.seed)  # the same call draws the same numbers, be it the first or not
-        hooks.on_training_start(locals(), globals())
-        try:
-            with (
-                console_for_bars(self.logger, progress_bar),
-                closing(meta_train(self, source, run, n_jobs, progress_bar)) as training,
-            ):
-                for metrics in training:
-                    for key, value in metrics.items():
-                        self.logger.record(key, value)
-                    self.logger.record("time/iterations", self.num_iterations, exclude="tensorboard")
-                    if self.num_iterations % max(1, total_timesteps // 200) == 0:
-                        self.logger.dump(self.num_iterations)
-                    hooks.update_locals(locals())
-                    if not hooks.on_step():
-                        break
-            if (model := self.model).n_situations > 1:
-                log_embeddings(self.logger, model.embeddings[0], self.situations, self.num_iterations)
-        except BaseException:
-            self.policy.world = known  # a half-learnt model is none
-            raise
-        hooks.on_training_end()
-        if isinstance(source, SituationEnvs) and check:
-            self._check(source)
-        return self
-
-    def _check(self, envs: SituationEnvs) -> None:
-        """Compares planning in simulation with knowing nothing, and warns where it is not better."""
-        found = self.last_check = check_plans(self, envs, self.seed or 0)
-        self.model.usual_error.fill_(float(np.median(found.errors).clip(min=1.0)))
-        for name in ("planned", "nothing", "random"):
-            self.logger.record(f"check/{name}", float(np.median(getattr(found, name))))
-        self.logger.dump(self.num_iterations)
-        if self.verbose:
-            print(found)
-        if not found.worth:
-            warnings.warn(
-                "In simulation, planning with what was learnt is no better than doing nothing or acting at random, so "
-                "that it will not be on the robot either. Try more simulated steps (policy_steps), a reward_fn, fewer "
-                f"or milder situations, or whether Stable-Baselines3's SAC learns the intact robot at all.\n{found}",
-                stacklevel=4,
-            )
-
-    @torch.inference_mode(mode=False)
-    def collect(self, envs: SituationsLike | None = None, progress_bar: bool = False, n_jobs: int = 1) -> Transitions:
-        """Collects random transitions in every situation; arguments as of :meth:`meta_learn`.
-
-        They are what that learns from, but where it learns a policy first (``policy_steps``).
-        """
-        source = self.situation_envs(envs)
-        n = self.config.simulation.transitions_per_situation * len(source.sources)
-        with tqdm(total=n, desc="Simulating", unit="step", mininterval=1.0, disable=not progress_bar) as bar:
-            return simulate(self, source, 0, n_jobs, None, bar.update)
-
-    def situation_envs(self, envs: SituationsLike | None = None) -> SituationEnvs:
-        """Makes or takes one environment per training situation; arguments and errors as of :meth:`meta_learn`."""
-        return situation_envs(self._require_env(), envs, self.config.simulation.episode_length)
-
-    def planning_policy(self) -> MakePolicy:
-        """Makes a policy that plans with what the agent has meta-learned, and knows which situation it is in."""
-        return planning_policy(self.policy)
-
-    def _fingerprint(self, source: SituationEnvs | Transitions) -> dict[str, Any]:
-        """What two runs must have in common for one to go on where the other stopped."""
-        return {
-            "agent": type(self).__name__,
-            "env": self._env_spec,
-            "dimensions": {name: list(dims) for name, dims in self.dims.items()},
-            "environment": None if self.env is None else identity(first_env(self.env)),
-            "reward_fn": identity(self.policy.user_reward_fn),
-            "termination_fn": identity(self.policy.user_termination_fn),
-            "seed": self.seed,
-            "sources": None if isinstance(source, Transitions) else identity(source.sources),
-            "situations": list(source.situations),
-            "transitions": source.digest() if isinstance(source, Transitions) else None,
-            "hyperparameters": {name: value for name, value in self.config.to_dict().items() if name not in SAFETY},
-        }
 
     # --- living on a robot ------------------------------------------------------------------------------
 
@@ -461,37 +261,31 @@ class ModelBasedAgent(StoredAgent):
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         hooks.on_training_start(locals(), globals())
-        perception, state, watch = self.perception, self.state_of(env.num_envs), VecWatch(env)
-        self._told = None
-        self._calls = watch.calls
+        perception, online, watch = self.perception, self._online, VecWatch(env)
+        state, self._calls = online.state_of(env.num_envs), watch.calls
         logger = Logger(None, []) if log_interval is None else self.logger
         with closing(AdaptationLog(self, logger, self.num_timesteps)) as log:
             while self.num_timesteps < total_timesteps:
                 hooks.on_rollout_start()
                 if watch.calls != self._calls:  # a callback has moved the robots
                     self._last_obs, self._last_episode_starts = env.reset(), np.ones(env.num_envs, dtype=bool)  # type: ignore[assignment]
-                starts = torch.as_tensor(self._last_episode_starts, dtype=torch.bool, device=self.device)
-                readings = self.policy.builder.tensor(vec_readings(self._last_obs, env))
-                self._last_obs, resets = None, watch.resets()  # the next learn() resets, should this step fail
-                state = perception.begin(state, readings, starts)
-                action, state = self._act(perception, state, starts, self.generator, self._deadline())
+                starts = self._flags(self._last_episode_starts)
+                readings = self._tensor(vec_readings(self._last_obs, env))
+                self._last_obs = None  # the next learn() resets, should this step fail
+                action, state = online.act(perception, state, readings, starts, self.generator)  # line 8
                 try:
-                    step = vec_step(env, to_action_space(action, self.action_space))
+                    step, reset_alone = watch.step(to_action_space(action, self.action_space))
                 except BaseException:
-                    self._senses = senses_of(state).dropping(torch.ones_like(starts))
+                    online.drop(state)
                     raise
                 self.num_timesteps, self._calls = self.num_timesteps + env.num_envs, watch.calls
+                moved = self._flags(step.known & ~reset_alone)
+                state = online.learn(perception, state, self._tensor(step.reached), moved)
                 # By names that callbacks know.
                 new_obs, rewards, dones, infos = step.obs, step.rewards, step.dones, step.infos
-                reset_alone = watch.resets() - resets != dones if len(resets) else np.zeros_like(dones)
-                lost = torch.as_tensor(reset_alone | ~step.known, device=self.device)
-                state, transitions = perception.sense(state, self.policy.builder.tensor(step.reached), ~lost)
-                state = replace(state, senses=senses_of(state).dropping(lost))
-                state = self._live = self._observed(self._learnt_from(perception, state, transitions))
-                self._senses = state.senses
                 self._last_obs, self._last_episode_starts = new_obs, dones | reset_alone
                 self._update_info_buffer(infos, dones)
-                log.step(self.newest, rewards, dones)
+                log.step(online.newest, rewards, dones)
                 hooks.update_locals(locals())
                 if not hooks.on_step():
                     break
@@ -499,11 +293,6 @@ class ModelBasedAgent(StoredAgent):
                 self._count_episodes(int(dones.sum()), log_interval)
         hooks.on_training_end()
         return self
-
-    def _close_logger(self) -> None:
-        """Ends the logger of the last call, which another takes the place of: TensorBoard's has a thread."""
-        if hasattr(self, "_logger") and not self._custom_logger:
-            self._logger.close()
 
     def _count_episodes(self, ended: int, log_interval: int | None) -> None:
         known, self._episode_num = self._episode_num, self._episode_num + ended
@@ -519,8 +308,8 @@ class ModelBasedAgent(StoredAgent):
         if not hasattr(self, "_logger"):
             raise ValueError("The agent has no logger yet; call learn() or set_logger() first.")
         log_episodes(self.logger, self.ep_info_buffer or (), self.ep_success_buffer or ())
-        if self._live is not None:
-            log_belief(self, self.logger, self._live)
+        if (state := self._online.state) is not None:
+            log_belief(self, self.logger, state)
         since_start = self.num_timesteps - self._num_timesteps_at_start
         log_time(self.logger, self.num_timesteps, since_start, self._episode_num, self.start_time)
         self.logger.dump(self.num_timesteps)
@@ -565,84 +354,24 @@ class ModelBasedAgent(StoredAgent):
             SensorError: No robot has had an observation that can be a measurement for too long.
             ValueError: The observation has the wrong shape, or is of no numbers.
         """
-        perception, deadline = self.perception, self._deadline()
+        perception, generator = self.perception, self.generator
         try:
             numbers = reading(observation, self.observation_space)
         except ValueError:
-            self._refused = state  # whose next observation is not one step behind its last one
+            self._online.refuse(state)
             raise
-        was_refused = state is not None and state is self._refused
-        readings = self.policy.builder.tensor(np.atleast_2d(numbers))
-        starts = torch.zeros(len(readings), dtype=torch.bool, device=self.device)
-        if episode_start is not None:
-            starts = torch.tensor(np.atleast_1d(episode_start), dtype=torch.bool, device=self.device)
+        readings = self._tensor(np.atleast_2d(numbers))
+        starts = self._flags(np.zeros(len(readings)) if episode_start is None else episode_start)
         if len(starts) != len(readings) or (state is not None and state.robots != len(readings)):
             raise ValueError(
                 f"Got {len(readings)} observations, but {len(starts)} values of episode_start and a state of "
                 f"{len(readings) if state is None else state.robots} robots; they must be of the same robots."
             )
-        generator = self.generator
         if deterministic:
             generator = torch.Generator(self.device).manual_seed(self.seed or 0)
-        given = state
-        if state is not None and was_refused:
-            state = replace(state, last=None)
-        state = self.state_of(len(readings)) if state is None else self._caught_up(perception, state, readings, starts)
-        state = perception.begin(state, readings, starts | was_refused)
-        try:
-            action, state = self._act(perception, state, starts, generator, deadline)
-        except SensorError:
-            self._refused = given
-            raise
-        if given is None and self._live is not None and self._live.robots == len(readings):
-            self._live = replace(self._live, plan=state.plan)  # a loop that drops the state keeps its plan
-        self._observed(state)
+        action, state = self._online.predict(perception, state, readings, starts, generator)
         actions = to_action_space(action, self.action_space)
         return (actions[0] if numbers.ndim == 1 else actions), state
-
-    def _act(
-        self,
-        perception: Perception,
-        state: OnlineState,
-        starts: torch.Tensor,
-        generator: torch.Generator,
-        deadline: Deadline | None,
-    ) -> tuple[torch.Tensor, OnlineState]:
-        """Plans by a deadline, and counts what was late."""
-        start = time.perf_counter()
-        planned = perception.act(state, starts, generator, deadline)
-        self._plan_ms = 1e3 * (time.perf_counter() - start)
-        if deadline is not None:
-            self.overruns += deadline.passed
-            self.cut_short += deadline.cut_short
-        return planned
-
-    def _learnt_from(self, perception: Perception, state: OnlineState, transitions: torch.Tensor) -> OnlineState:
-        """Learns from a step that ends here, and notes what became of it."""
-        start, self.newest = time.perf_counter(), None  # whose memory would be a third one
-        after = perception.observe(state, transitions)
-        self.newest = Experience(state, after, transitions, self._plan_ms, 1e3 * (time.perf_counter() - start))
-        self._plan_ms = None
-        return after
-
-    def _deadline(self) -> Deadline | None:
-        budget = self.config.safety.step_budget_ms
-        return None if budget is None else Deadline(budget, self.device)
-
-    def _caught_up(
-        self, perception: Perception, state: OnlineState, readings: torch.Tensor, starts: torch.Tensor
-    ) -> OnlineState:
-        """Adds the step that ends here to a state, unless :meth:`observe` was told of it."""
-        if state.last is None:
-            return state
-        sensed, transitions = perception.sense(state, readings, ~starts)
-        if self._live is None or self._told is None or len(self._told[0]) != len(readings):
-            return perception.observe(sensed, transitions)
-        (s, a, s_next), (last_s, last_a) = self._told, state.last
-        same_step = torch.equal(s, last_s) and torch.allclose(a, last_a, atol=1e-5)
-        if not (same_step and torch.equal(s_next[~starts], senses_of(sensed).obs[~starts])):
-            return perception.observe(sensed, transitions)
-        return replace(self._live, plan=state.plan, last=None, senses=self._senses)
 
     @torch.inference_mode(mode=False)
     def observe(self, obs: Array | None, action: Array, next_obs: Array | None) -> None:
@@ -659,19 +388,12 @@ class ModelBasedAgent(StoredAgent):
             NotLearnedError: The agent has no model yet.
             ValueError: A shape is wrong, or the action is not finite.
         """
-        perception, space = self.perception, self.observation_space
-        s, s_next = (self.policy.builder.tensor(np.atleast_2d(reading(o, space))) for o in (obs, next_obs))
-        a = self.policy.builder.tensor(np.atleast_2d(check_action(action, self.action_space)))
+        perception, s, s_next = self.perception, self._readings(obs), self._readings(next_obs)
+        a = self._tensor(np.atleast_2d(check_action(action, self.action_space)))
         if not len(s) == len(a) == len(s_next):
             raise ValueError(f"Got {len(s)} observations, {len(a)} actions and {len(s_next)} next observations.")
         a = self.policy.builder.action_scale.to_unit(a).clamp(-1.0, 1.0)
-        everyone = torch.ones(len(s), dtype=torch.bool, device=self.device)
-        state = perception.begin(self.state_of(len(s)), s, ~everyone)
-        s = senses_of(state).obs
-        state, transitions = perception.sense(replace(state, last=(s, a)), s_next, everyone)
-        self._told = s, a, senses_of(state).obs
-        self._live = self._observed(self._learnt_from(perception, state, transitions))
-        self._senses = self._live.senses
+        self._online.observe(perception, s, a, s_next)
 
     @torch.inference_mode(mode=False)
     def locate(self, obs: Array | None, dropped: bool = False) -> None:
@@ -685,21 +407,17 @@ class ModelBasedAgent(StoredAgent):
             NotLearnedError: The agent has no model yet.
             ValueError: The shape is wrong.
         """
-        readings = self.policy.builder.tensor(np.atleast_2d(reading(obs, self.observation_space)))
-        everyone = torch.ones(len(readings), dtype=torch.bool, device=self.device)
-        state = self.perception.begin(self.state_of(len(readings)), readings, everyone)
-        self._senses = senses_of(state).dropping(everyone & dropped)
+        readings = self._readings(obs)
+        self._online.locate(self.perception, readings, dropped)
 
     @torch.inference_mode(mode=False)
     def begin_episode(self) -> None:
         """Tells the agent that its robot was reset: its plan is void, its memory stays."""
-        if self._live is not None:
-            starts = torch.ones(self._live.robots, dtype=torch.bool, device=self.device)
-            self._live = self._observed(self.controller.reset(self._live, starts))
+        self._online.begin_episode()
 
     def forget(self) -> None:
         """Returns to what was meta-learned, as for a robot that was just repaired; counts of sensors begin at 0."""
-        self._live = self._senses = self.newest = None
+        self._online.forget()
 
     def serve(self, wrapper: object, takes_over: bool = True) -> None:
         """Notes whose robot the agent is on.
@@ -708,8 +426,8 @@ class ModelBasedAgent(StoredAgent):
             RuntimeError: The agent serves another wrapper, and this one does not take over.
         """
         if takes_over:
-            self._served = wrapper
-        elif self._served is not wrapper:
+            self._wrapper = wrapper
+        elif self._wrapper is not wrapper:
             raise RuntimeError(
                 "The agent has been taken over by another FAMLEWrapper. Call reset() to take it back, or give each "
                 "robot an agent of its own: FAMLE.load(path)."
@@ -721,21 +439,27 @@ class ModelBasedAgent(StoredAgent):
         Raises:
             ValueError: The robot's reward differs from that of the agent's environment.
         """
-        known, names = self.policy.known_reward_fn, reward_names(self.config.planning_reward)
-        if known is None or known is self.policy.user_reward_fn:
-            return
-        own = other_reward(env, known, names, self.observation_space, self.action_space)
-        if own is not None:
-            raise ValueError(
-                f"The agent plans for the {own} of its own environment, which gives other rewards than that of the "
-                "environment to be wrapped, because of its goal or of a wrapper: call agent.set_env(env) first, or "
-                "give the agent a reward_fn."
-            )
+        self.policy.check_task(env)
 
     @property
     def belief(self) -> Belief:
         """What the agent believes of its robots now; of one robot where it has seen none."""
-        return (self._live or self.state_of(self.model.robots)).belief
+        return self._online.state_for(None, robot=0).belief
+
+    @property
+    def newest(self) -> Experience | None:
+        """The last step that :meth:`learn` or :meth:`observe` learnt from, and what became of it."""
+        return self._online.newest
+
+    @property
+    def overruns(self) -> int:
+        """How often planning took longer than ``step_budget_ms``."""
+        return self._online.overruns
+
+    @property
+    def cut_short(self) -> int:
+        """How often the planner left out iterations, so that it would not."""
+        return self._online.cut_short
 
     @torch.inference_mode(mode=False)
     def posterior(self, state: OnlineState | None = None, robot: int = 0) -> dict[str, float]:
@@ -752,19 +476,19 @@ class ModelBasedAgent(StoredAgent):
             IndexError: There is no such robot.
             NotLearnedError: The agent has no model yet.
         """
-        return self.adapter.posterior(self._state_for(state, robot).belief.of(robot), self.situations)
+        return self.adapter.posterior(self._online.state_for(state, robot).belief.of(robot), self.situations)
 
     @torch.inference_mode(mode=False)
     def marginals(self, state: OnlineState | None = None, robot: int = 0) -> dict[str, float]:
         """As :meth:`posterior`, but of each training situation, be it alone or a part of what is wrong."""
-        return self.adapter.marginals(self._state_for(state, robot).belief.of(robot), self.situations)
+        return self.adapter.marginals(self._online.state_for(state, robot).belief.of(robot), self.situations)
 
     def diagnose(self, state: OnlineState | None = None, robot: int = 0) -> Diagnosis:
         """Says in words what is most likely wrong with a robot, and how sure that is: ``print(agent.diagnose())``.
 
         Arguments and errors as of :meth:`posterior`.
         """
-        state = self._state_for(state, robot)
+        state = self._online.state_for(state, robot)
         error, steps = state.belief.errors[robot] / self.model.usual_error, int(state.memory.weight[robot].sum())
         return Diagnosis.of(self.posterior(state, robot), float(error), steps)
 
@@ -785,44 +509,8 @@ class ModelBasedAgent(StoredAgent):
         Raises:
             IndexError: There is no such robot.
         """
-        senses = self._senses if state is None else state.senses
-        if senses is None:
-            senses = senses_of(self._state_for(state, robot))
-        if not 0 <= robot < senses.robots:
-            raise IndexError(f"There are robots 0 to {senses.robots - 1}, not {robot}.")
-        counts = {name: int(count[robot]) for name, count in senses.counts.items()}
-        return {**counts, "overruns": self.overruns, "cut_short": self.cut_short}
+        return self._online.health(state, robot)
 
-    def _state_for(self, state: OnlineState | None, robot: int) -> OnlineState:
-        state = state or self._live or self.state_of(self.model.robots)
-        if not 0 <= robot < state.robots:
-            raise IndexError(f"There are robots 0 to {state.robots - 1}, not {robot}.")
-        return state
-
-    def _observed(self, state: OnlineState) -> OnlineState:
-        """Passes a state on, and warns of the first adaptation that diverged and of the first sensor that failed."""
-        senses = state.senses
-        if not self._warned_of_sensors and senses is not None and not senses.measured.all():
-            self._warned_of_sensors = True
-            robots = (~senses.measured).nonzero()[:, 0].tolist()
-            warnings.warn(
-                f"An observation of robot {', '.join(map(str, robots))} cannot be a measurement: "
-                f"{senses.reading[robots[0]].tolist()}. It is not learnt from, and plans begin where the model "
-                'says that the robot is. info["famle"] and TensorBoard count these from here on.',
-                stacklevel=4,
-            )
-        if not self._warned_of_divergence and state.belief.diverged.any():
-            self._warned_of_divergence = True
-            warnings.warn(
-                f"Adaptation {state.belief.adaptations} diverged: its gradient steps left the finite numbers and were "
-                "taken back. Take smaller rates (adapt_lr, adapt_embedding_lr), or meta-learn on data that reach where "
-                'the robot is (action_hold, episode_length, rounds). info["famle"]["diverged"] and adapt/diverged '
-                "count them from here on.",
-                stacklevel=4,
-            )
-        return state
-
-    @torch.inference_mode(mode=False)
     def state_of(self, robots: int) -> OnlineState:
         """Returns what the agent believes now where that fits the number of robots, else what it meta-learned.
 
@@ -832,10 +520,20 @@ class ModelBasedAgent(StoredAgent):
         Raises:
             NotLearnedError: The agent has no model yet.
         """
-        senses = self._senses if self._senses is not None and self._senses.robots == robots else None
-        if self._live is not None and self._live.robots == robots:
-            return replace(self._live, last=None, senses=senses)
-        return replace(self.policy.initial(robots), senses=senses)
+        return self._online.state_of(robots)
+
+    # --- from arrays to tensors -------------------------------------------------------------------------
+
+    def _readings(self, obs: Array | None) -> torch.Tensor:
+        """What sensors say, (obs_dim,) or (B, obs_dim) or None -> (B, obs_dim)."""
+        return self._tensor(np.atleast_2d(reading(obs, self.observation_space)))
+
+    def _tensor(self, values: Array) -> torch.Tensor:
+        return self.policy.builder.tensor(values)
+
+    def _flags(self, values: Any) -> torch.Tensor:
+        """Whether something is so of each robot, (B,)."""
+        return torch.tensor(np.atleast_1d(values), dtype=torch.bool, device=self.device)
 
 
 def _check_policy(env: object, policy: object) -> None:

@@ -4,45 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from famle_agent.adaptation.controller import OnlineState
 from famle_agent.adaptation.perception import senses_of
+from famle_agent.agents.online_adaptation import Experience
 from famle_agent.agents.pictures import Path
+from famle_agent.agents.policy import AdaptivePolicy
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.simulator import Simulator
 
-if TYPE_CHECKING:
-    from famle_agent.agents.agent import ModelBasedAgent
-
-__all__ = ["Experience", "Models", "Step", "Window"]
-
-
-@dataclass(frozen=True)
-class Experience:
-    """Records the newest step of B robots.
-
-    Attributes:
-        before: What the agent believed when it had taken place.
-        after: What it believes since it learnt from it.
-        transitions: Which robots went through a transition that can be learnt from, (B,).
-        plan_ms: Milliseconds that the plan took; None where somebody else has acted.
-        adapt_ms: Those that learning from it took.
-    """
-
-    before: OnlineState
-    after: OnlineState
-    transitions: Tensor
-    plan_ms: float | None
-    adapt_ms: float
-
-    @property
-    def adapted(self) -> bool:
-        """Whether the robots have adapted in this step."""
-        return self.after.belief.adaptations > self.before.belief.adaptations
+__all__ = ["Models", "Step", "Window"]
 
 
 @dataclass(frozen=True)
@@ -116,16 +90,16 @@ class Models:
     after: Simulator
 
     @classmethod
-    def of(cls, agent: ModelBasedAgent, known: OnlineState) -> Models:
+    def of(cls, policy: AdaptivePolicy, known: OnlineState) -> Models:
         """Takes what the robots have before their first step."""
-        new = agent.policy.initial(known.robots)
-        begins = agent.adapter.model_for(known.belief, known.memory)
-        return cls(agent.adapter.model_for(new.belief, new.memory), begins, begins)
+        new = policy.initial(known.robots)
+        begins = policy.adapter.model_for(known.belief, known.memory)
+        return cls(policy.adapter.model_for(new.belief, new.memory), begins, begins)
 
-    def adapted(self, agent: ModelBasedAgent, newest: Experience) -> Models:
+    def adapted(self, policy: AdaptivePolicy, newest: Experience) -> Models:
         """Takes what they had before an adaptation, and after it."""
         states = newest.before, newest.after
-        return Models(self.unadapted, *(agent.adapter.model_for(state.belief, state.memory) for state in states))
+        return Models(self.unadapted, *(policy.adapter.model_for(state.belief, state.memory) for state in states))
 
     def errors(self, model: Dynamics, window: Window) -> dict[str, float]:
         """Compares their errors on transitions that none of them has been adapted to, in those of simulation."""

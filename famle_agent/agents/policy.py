@@ -6,8 +6,10 @@ import warnings
 from dataclasses import replace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
+from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from famle_agent.adaptation.adapters import EmbeddingAdapter, GradientAdapter
@@ -19,6 +21,9 @@ from famle_agent.adaptation.perception import Perception
 from famle_agent.adaptation.senses import Sensors
 from famle_agent.agents.config import Config
 from famle_agent.agents.world_model import Interface, ModelBuilder, WorldModel
+from famle_agent.data.objective import other_reward, planning_reward, planning_termination
+from famle_agent.data.policies import reward_names
+from famle_agent.data.probe import check_reward_fn, check_termination_fn
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.reward import Objective, RewardFn, TerminationFn
 from famle_agent.utils.errors import NotLearnedError
@@ -187,6 +192,40 @@ class AdaptivePolicy:
             stacklevel=5,
         )
         return None
+
+    def take_task(self, env: VecEnv) -> None:
+        """Looks in an environment for what to maximise and for where episodes end, unless the user has said it.
+
+        Raises:
+            ValueError: A function is none of batches, or what it would be given is changed by a wrapper.
+        """
+        if self.user_reward_fn is None:
+            self.env_reward_fn, self.doubts_reward_fn = planning_reward(env, self.config.planning_reward)
+        if self.user_termination_fn is None:
+            self.env_termination_fn = planning_termination(env)
+        robot = self.builder.robot
+        if (reward_fn := self.user_reward_fn or self.env_reward_fn) is not None:
+            check_reward_fn(reward_fn, robot.observation_space, robot.action_space, self.device)
+        if (termination_fn := self.known_termination_fn) is not None:
+            check_termination_fn(termination_fn, robot.observation_space, self.device)
+
+    def check_task(self, env: gym.Env[Any, Any]) -> None:
+        """Refuses a robot with another task than the policy plans for.
+
+        Raises:
+            ValueError: The robot's reward differs from that of the agent's environment.
+        """
+        known, robot = self.known_reward_fn, self.builder.robot
+        if known is None or known is self.user_reward_fn:
+            return
+        names = reward_names(self.config.planning_reward)
+        own = other_reward(env, known, names, robot.observation_space, robot.action_space)
+        if own is not None:
+            raise ValueError(
+                f"The agent plans for the {own} of its own environment, which gives other rewards than that of the "
+                "environment to be wrapped, because of its goal or of a wrapper: call agent.set_env(env) first, or "
+                "give the agent a reward_fn."
+            )
 
     @property
     def known_reward_fn(self) -> RewardFn | None:

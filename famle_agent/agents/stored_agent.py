@@ -14,9 +14,11 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import get_system_info
 from typing_extensions import Self
 
-from famle_agent.adaptation.controller import OnlineState
+from famle_agent.adaptation.controller import Adapter, Controller
+from famle_agent.adaptation.perception import Perception
 from famle_agent.agents.checkpoint import Checkpoint, File, joined
 from famle_agent.agents.config import Config
+from famle_agent.agents.online_adaptation import OnlineAdaptation
 from famle_agent.agents.parameters import Parameters, parameters_of, with_parameters
 from famle_agent.agents.policy import AdaptivePolicy
 from famle_agent.agents.presets import make_env
@@ -43,7 +45,7 @@ class StoredAgent(BaseAlgorithm):
     action_space: spaces.Box
     mode: str
     generator: torch.Generator
-    _live: OnlineState | None
+    _online: OnlineAdaptation
     _env_spec: dict[str, Any] | None
 
     # --- what it has learnt -----------------------------------------------------------------------------
@@ -66,6 +68,21 @@ class StoredAgent(BaseAlgorithm):
     def situations(self) -> tuple[str, ...]:
         """What the training situations are called, in the order of the model's embeddings."""
         return () if self.policy.world is None else self.policy.world.situations
+
+    @property
+    def adapter(self) -> Adapter:
+        """What adapts the model; see :class:`~famle_agent.agents.policy.AdaptivePolicy`, here and below."""
+        return self.policy.adapter
+
+    @property
+    def controller(self) -> Controller:
+        """Algorithm 2 with the agent's adapter, planner and reward."""
+        return self.policy.controller
+
+    @property
+    def perception(self) -> Perception:
+        """The same on robots whose sensors may fail."""
+        return self.policy.perception
 
     @property
     def config(self) -> Config:
@@ -109,7 +126,7 @@ class StoredAgent(BaseAlgorithm):
         """
         if not hasattr(self, "observation_space"):
             raise ValueError("This agent has no environment, so that there is nothing to save; make it with one.")
-        live = self._live
+        live = self._online.state
         Checkpoint(
             kind=type(self).__name__,
             mode=self.mode,
@@ -234,17 +251,17 @@ class StoredAgent(BaseAlgorithm):
 
     def _take_over(self, stored: Checkpoint) -> None:
         policy = self.policy
-        known = policy.world, self._live
+        known = policy.world, self._online.state
         try:
             weights = {name: stored.part(name) for name in ("dynamics", "reward", "termination", "actor_critic")}
             if weights["dynamics"]:
                 policy.world = policy.builder.load(weights, stored.situations)
             if stored.live is not None:
-                self._live = policy.stored_state(stored.part("live"), stored.live)
+                self._online.state = policy.stored_state(stored.part("live"), stored.live)
             if self.device.type == "cpu" and (generator := stored.part("generator")):
                 self.generator.set_state(generator["state"])
         except (LookupError, RuntimeError, TypeError, ValueError) as error:
-            policy.world, self._live = known  # nothing is half-taken
+            policy.world, self._online.state = known  # nothing is half-taken
             raise ValueError(
                 "The file's weights do not fit its settings; it is damaged, or an override changed the network: "
                 f"{error}"
@@ -285,7 +302,7 @@ class StoredAgent(BaseAlgorithm):
             stored.check_agent(type(self).__name__, has_reward_fn=True, has_termination_fn=True)
             given, situations = stored.weights(), stored.situations
         self.policy.world = with_parameters(self.policy, given, situations, exact_match)
-        self._live = None
+        self._online.state = None
 
     def _names_for(self, parameters: Parameters) -> tuple[str, ...]:
         """What the situations of an agent without a model are called, whose weights are given without any names."""

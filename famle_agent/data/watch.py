@@ -11,6 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from stable_baselines3.common.vec_env import VecEnv
 
+from famle_agent.data.gate import VecStep, vec_step
+
 __all__ = ["VecWatch", "Watch"]
 
 
@@ -59,6 +61,7 @@ class VecWatch:
 
     def __init__(self, env: VecEnv) -> None:
         base: Any = env.unwrapped
+        self._env = env
         self._base = [_counted(base, name) for name in ("reset", "step_wait")]
         inside = getattr(base, "envs", None)
         known = isinstance(inside, list) and len(inside) == env.num_envs
@@ -69,7 +72,19 @@ class VecWatch:
         """How often any of the robots was stepped or reset."""
         return sum(method.calls for method in self._base) + sum(robot.calls for robot in self._robots)
 
-    def resets(self) -> npt.NDArray[np.int64]:
+    def step(self, actions: npt.NDArray[Any]) -> tuple[VecStep, npt.NDArray[np.bool_]]:
+        """Steps the robots; arguments and errors as of :func:`~famle_agent.data.gate.vec_step`.
+
+        Returns:
+            What they returned, and which of them were reset otherwise than by the end of their episode, (n,); none
+            where they are in other processes.
+        """
+        before = self._resets()
+        step = vec_step(self._env, actions)
+        resets = self._resets() - before
+        return step, resets != step.dones if len(resets) else np.zeros_like(step.dones)
+
+    def _resets(self) -> npt.NDArray[np.int64]:
         """How often each robot was reset, (n,); (0,) where they are in other processes."""
         return np.array([robot.resets for robot in self._robots], dtype=np.int64)
 

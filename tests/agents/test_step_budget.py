@@ -69,7 +69,7 @@ def test_random_shooting_has_one_iteration() -> None:
 def test_overruns_are_counted(monkeypatch: pytest.MonkeyPatch, passes_state: bool) -> None:
     ticks = count()
     slow = partial(Deadline, clock=lambda: 0.01 * next(ticks))  # each look at the clock takes 10 ms
-    monkeypatch.setattr("famle_agent.agents.agent.Deadline", slow)
+    monkeypatch.setattr("famle_agent.agents.online_adaptation.Deadline", slow)
     late, in_time = (agent_of(planner_iterations=4, step_budget_ms=ms) for ms in (5.0, 1000.0))
     for agent in (late, in_time):
         robot = Cart()
