@@ -280,7 +280,7 @@ class ModelBasedAgent(MetaLearningAgent):
                     raise
                 self.num_timesteps, self._calls = self.num_timesteps + env.num_envs, watch.calls
                 moved = self._flags(step.known & ~reset_alone)
-                state = online.learn(perception, state, self._tensor(step.reached), moved)
+                state = online.learn(perception, state, self._tensor(step.reached), moved)  # lines 9, 10, then 4 to 7
                 # By names that callbacks know.
                 new_obs, rewards, dones, infos = step.obs, step.rewards, step.dones, step.infos
                 self._last_obs, self._last_episode_starts = new_obs, dones | reset_alone
