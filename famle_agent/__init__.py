@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from famle_agent.agents.famle import FAMLE
     from famle_agent.agents.wrapper import FAMLEWrapper
     from famle_agent.data.transitions import Transitions
+    from famle_agent.data.truncate_on_error import TruncateOnError
     from famle_agent.utils.errors import NotLearnedError, SensorError
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "OnlineState",
     "SensorError",
     "Transitions",
+    "TruncateOnError",
     "__version__",
 ]
 
@@ -50,6 +52,7 @@ _MODULES = {
     "OnlineState": "adaptation.controller",
     "SensorError": "utils.errors",
     "Transitions": "data.transitions",
+    "TruncateOnError": "data.truncate_on_error",
 }
 
 

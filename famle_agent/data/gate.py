@@ -15,6 +15,8 @@ import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
+from famle_agent.data.watch import VecWatch
+
 __all__ = [
     "Step",
     "VecStep",
@@ -25,6 +27,7 @@ __all__ = [
     "numbers",
     "reading",
     "reset",
+    "robot_reset",
     "robot_step",
     "step",
     "vec_readings",
@@ -194,7 +197,7 @@ def _info(value: Any) -> dict[str, Any]:
 
 
 def reset(env: gym.Env[Any, Any], **arguments: Any) -> tuple[Array, dict[str, Any]]:
-    """Resets an environment.
+    """Resets a simulated environment.
 
     Args:
         env: The environment.
@@ -206,11 +209,21 @@ def reset(env: gym.Env[Any, Any], **arguments: Any) -> tuple[Array, dict[str, An
     Raises:
         ValueError: Something that it returned has a wrong type or shape, or is not finite.
     """
+    obs, info = robot_reset(env, **arguments)
+    numbers("observation", obs)
+    return obs, info
+
+
+def robot_reset(env: gym.Env[Any, Any], **arguments: Any) -> tuple[Any, dict[str, Any]]:
+    """Resets a robot, whose sensors may fail: its observation may hold no finite numbers, or be None.
+
+    Arguments, returns and errors otherwise as of :func:`reset`.
+    """
     returned = env.reset(**arguments)
     if not isinstance(returned, tuple) or len(returned) != 2:
         raise ValueError(f"reset() of {env} must return (obs, info), got {_what(returned)}.")
-    numbers("observation", returned[0])
-    return _observed(returned[0], env), _info(returned[1])
+    obs, info = returned
+    return None if obs is None else _observed(obs, env), _info(info)
 
 
 def step(env: gym.Env[Any, Any], action: Any) -> Step:
@@ -299,9 +312,11 @@ def vec_step(env: VecEnv, actions: Array) -> VecStep:
 
     Raises:
         ValueError: Something that they returned has a wrong type or shape.
+        Exception: What a robot has raised, with a note of its index where the robots are in this process.
     """
     n = env.num_envs
-    obs, rewards, dones, infos = env.step(np.array(actions))
+    with VecWatch(env).noting_who_fails():
+        obs, rewards, dones, infos = env.step(np.array(actions))
     for name, values, check in (("rewards", rewards, floats), ("dones", dones, numbers)):
         if (array := check(name, values)).shape != (n,):
             raise ValueError(f"The {name} of a VecEnv of {n} robots must have shape ({n},), got {array.shape}.")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import update_wrapper
 from typing import Any
 
@@ -47,9 +48,14 @@ class Watch:
         return self._resets.calls
 
     @property
+    def steps(self) -> int:
+        """How often it was stepped."""
+        return self._steps.calls
+
+    @property
     def calls(self) -> int:
         """How often it was stepped or reset."""
-        return self._resets.calls + self._steps.calls
+        return self.resets + self.steps
 
 
 class VecWatch:
@@ -87,6 +93,22 @@ class VecWatch:
     def _resets(self) -> npt.NDArray[np.int64]:
         """How often each robot was reset, (n,); (0,) where they are in other processes."""
         return np.array([robot.resets for robot in self._robots], dtype=np.int64)
+
+    @contextmanager
+    def noting_who_fails(self) -> Iterator[None]:
+        """Adds a note to an exception of a step: which robot was stepped last, and how the others would go on."""
+        before = [robot.steps for robot in self._robots]
+        try:
+            yield
+        except Exception as error:
+            stepped = [i for i, robot in enumerate(self._robots) if robot.steps > before[i]]
+            if stepped:
+                note = (
+                    f"Robot {stepped[-1]} of {len(before)} was stepped last. Wrap each robot in "
+                    "famle_agent.TruncateOnError for the others to go on where one of them fails."
+                )
+                error.__notes__ = [*getattr(error, "__notes__", ()), note]  # add_note is of Python 3.11
+            raise
 
 
 def _counted(robot: Any, name: str) -> _Counted:

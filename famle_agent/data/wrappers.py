@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import (
     VecVideoRecorder,
 )
 
+from famle_agent.data.truncate_on_error import TruncateOnError
 from famle_envs.faults import FaultWrapper
 from famle_envs.wrappers import RandomSituation
 
@@ -62,6 +63,7 @@ _GYMNASIUM: dict[type, Change] = {
             *(wrappers.RenderCollection, wrappers.AddWhiteNoise, wrappers.ObstructView),
             *(wrappers.DelayObservation, wrappers.DtypeObservation, wrappers.StickyAction, wrappers.ClipAction),
             *(FaultWrapper, RandomSituation),  # what they change is inside the robot
+            TruncateOnError,
         ),
         Change.NOTHING,
     ),
