@@ -10,12 +10,15 @@ steps with changing damage, of environments that are made and closed, and of lea
 
 from __future__ import annotations
 
+import gc
 import os
 import resource
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -33,6 +36,7 @@ from benchmarks.results import provenance, store
 from benchmarks.runner import launch
 from famle_agent.agents.famle import FAMLE
 from famle_agent.agents.presets import known_robots
+from famle_envs.engines import ENGINES
 
 GROWTH = 0.05
 """By how much of itself memory may grow from the second fifth of a long run to its last."""
@@ -54,9 +58,9 @@ class Args:
     """Damaged inputs of each reader."""
     steps: int = 5000
     """Control steps of the ant; its damage changes every 100."""
-    environments: int = 500
-    """Environments that are made and closed, all robots in turn."""
-    learns: int = 50
+    environments: int = 2000
+    """Environments that are made and closed, all robots in all engines in turn."""
+    learns: int = 200
     """Calls of learn()."""
     seed: int = 0
     """Of the moments and the inputs."""
@@ -192,23 +196,35 @@ def control(args: Args) -> Iterator[Row]:
 
 
 def environments(args: Args) -> Iterator[Row]:
-    """Makes robots and closes them."""
+    """Makes robots in all engines that are installed, and closes them."""
     ids = [robot.env_id for robot in known_robots().values() if robot.env_id]
+    kinds = list(product(ids, [engine for engine in ENGINES if find_spec(engine)]))
 
     def once(i: int) -> None:
-        env = gym.make(ids[i % len(ids)])
+        env_id, engine = kinds[i % len(kinds)]
+        env = gym.make(env_id, engine=engine)
         env.reset(seed=i)
         env.step(env.action_space.sample())
         env.close()
 
-    yield _repeated("make() and close()", args.environments, once)
+    yield repeated("make() and close()", args.environments, once)
 
 
 def learning(args: Args) -> Iterator[Row]:
-    """Learns on a robot again and again, with TensorBoard."""
+    """Learns on a robot again and again, with TensorBoard, by one agent and by many that are let go."""
     with TemporaryDirectory() as folder:
         agent = FAMLE("reacher", seed=args.seed, device="cpu", tensorboard_log=folder, **TINY).meta_learn(SITUATIONS)
-        yield _repeated("learn()", args.learns, lambda _: agent.learn(10))
+        yield repeated("learn()", args.learns, lambda _: agent.learn(10))
+        file = Path(folder) / "agent.zip"
+        agent.save(file)
+
+        def once(_: int) -> None:
+            another = FAMLE.load(file)
+            another.tensorboard_log = folder
+            another.learn(10)
+            another.get_env().close()  # type: ignore[union-attr]
+
+        yield repeated("load() and learn()", args.learns, once)
     agent.get_env().close()  # type: ignore[union-attr]
 
 
@@ -222,22 +238,30 @@ PARTS: Mapping[str, Callable[[Args], Iterator[Row]]] = {
 """What can be tried, by name."""
 
 
-def _repeated(tried: str, times: int, once: Callable[[int], object]) -> Row:
-    """Does something again and again, and counts what is left of it."""
+def repeated(tried: str, times: int, once: Callable[[int], object]) -> Row:
+    """Does something again and again, and counts what is left of it; a fifth of the time fills caches."""
     memory, first = np.zeros(times), dict[str, int]()
     for i in range(times):
         once(i)
         memory[i] = _memory()
         if i == times // 5:
             first = _held()
-    more = {name: number - first[name] for name, number in _held().items()}
-    leaked = [f"{number} more {name}" for name, number in more.items() if number > 0]
-    return Row(tried, times, leaked + _grown(memory), {"memory growth": _growth(memory), **more})
+    last = _held()
+    more = {name: last[name] - first.get(name, 0) for name in last}
+    allowed = {"objects": times // 2}  # fewer than are left where each time leaves one
+    leaked = [f"{number} more {name}" for name, number in more.items() if number > allowed.get(name, 0)]
+    row = Row(tried, times, leaked + _grown(memory), {"memory growth": _growth(memory)})
+    row.figures |= {"MB before": _median(memory, 1), "MB after": _median(memory, 4)}
+    for name in last:
+        row.figures |= {f"{name} before": first.get(name, 0), f"{name} after": last[name]}
+    return row
 
 
 def _held() -> dict[str, int]:
-    """What this process has: threads, open files and PyBullet's clients."""
+    """What this process has: threads, open files, objects of Python, and PyBullet's clients."""
+    gc.collect()
     held = {"threads": len(os.listdir("/proc/self/task")), "files": len(os.listdir("/proc/self/fd"))}
+    held["objects"] = len(gc.get_objects())
     if (bullet := sys.modules.get("pybullet")) is not None:
         held["clients"] = sum(bullet.isConnected(i) for i in range(1024))
     return held
@@ -256,8 +280,12 @@ def _peak() -> float:
 
 def _growth(values: npt.NDArray[np.float64]) -> float:
     """By how much of itself the median has grown from the second fifth to the last."""
-    fifths = np.array_split(values, 5)
-    return float(np.median(fifths[-1]) / np.median(fifths[1]) - 1.0)
+    return _median(values, 4) / _median(values, 1) - 1.0
+
+
+def _median(values: npt.NDArray[np.float64], fifth: int) -> float:
+    """The median of one of five equal parts of a long run."""
+    return float(np.median(np.array_split(values, 5)[fifth]))
 
 
 def _grown(memory: npt.NDArray[np.float64]) -> list[str]:

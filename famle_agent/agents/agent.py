@@ -25,7 +25,7 @@ from famle_agent.adaptation.controller import OnlineState
 from famle_agent.adaptation.diagnosis import Diagnosis
 from famle_agent.agents.adaptation_log import AdaptationLog, log_belief
 from famle_agent.agents.config import Config
-from famle_agent.agents.logs import log_episodes, log_time
+from famle_agent.agents.logs import close_when_let_go, log_episodes, log_time
 from famle_agent.agents.meta_learning_agent import MetaLearningAgent
 from famle_agent.agents.online_adaptation import Experience, OnlineAdaptation
 from famle_agent.agents.policy import AdaptivePolicy
@@ -260,6 +260,8 @@ class ModelBasedAgent(MetaLearningAgent):
         total_timesteps, hooks = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
+        if not self._custom_logger:
+            close_when_let_go(self.logger)
         hooks.on_training_start(locals(), globals())
         perception, online, watch = self.perception, self._online, VecWatch(env)
         state, self._calls = online.state_of(env.num_envs), watch.calls

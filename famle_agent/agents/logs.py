@@ -4,14 +4,34 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+import weakref
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any
 
-from stable_baselines3.common.logger import HumanOutputFormat, Logger
+from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger
 from stable_baselines3.common.utils import safe_mean
 
-__all__ = ["console_for_bars", "log_episodes", "log_time"]
+__all__ = ["close_when_let_go", "console_for_bars", "log_episodes", "log_time"]
+
+
+def close_when_let_go(logger: Logger) -> Logger:
+    """Closes what a logger writes to as soon as nobody has the logger: TensorBoard's writer has a thread.
+
+    Args:
+        logger: A logger that was made for an agent.
+
+    Returns:
+        The logger.
+    """
+    weakref.finalize(logger, _close, logger.output_formats).atexit = False
+    return logger
+
+
+def _close(formats: Sequence[KVWriter]) -> None:
+    for output in formats:
+        with suppress(OSError):  # of a folder that is gone, as whoever has written there knows
+            output.close()
 
 
 def log_time(logger: Logger, total: int, since_start: int, episodes: int, start: float) -> None:

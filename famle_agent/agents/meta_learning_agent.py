@@ -17,7 +17,7 @@ from typing_extensions import Self
 
 from famle_agent.agents.check import Check, check_plans
 from famle_agent.agents.keywords import SAFETY
-from famle_agent.agents.logs import console_for_bars
+from famle_agent.agents.logs import close_when_let_go, console_for_bars
 from famle_agent.agents.meta_training import meta_train, planning_policy, simulate
 from famle_agent.agents.stored_agent import StoredAgent
 from famle_agent.agents.tensorboard import log_embeddings
@@ -88,7 +88,7 @@ class MetaLearningAgent(StoredAgent):
         self._close_logger()
         if not self._custom_logger:
             name = tb_log_name or f"{type(self).__name__}_meta"
-            self._logger = configure_logger(self.verbose, self.tensorboard_log, name)
+            self._logger = close_when_let_go(configure_logger(self.verbose, self.tensorboard_log, name))
         hooks = self._init_callback(callback)
         # The name that callbacks look for.
         total_timesteps = self.config.iterations(0 if isinstance(source, Transitions) else self.config.last_round)

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import gc
 import io
+import shutil
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -8,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.logger import Logger, configure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from famle_agent import FAMLE, Transitions
 from famle_agent.agents.tensorboard import encode_gif, log_gif
 from famle_agent.app.plots import plot_returns
+from tests.conftest import QUICK
 
 
 def read(folder: Path) -> EventAccumulator:
@@ -116,3 +119,29 @@ def test_calls_leave_no_thread_behind(quick_agent: FAMLE, tmp_path: Path) -> Non
         quick_agent.learn(2)
     assert threading.active_count() == threads
     assert len(list(tmp_path.rglob("events.*"))) == 4
+
+
+@pytest.mark.parametrize("call", ["learn", "meta_learn"])
+def test_agents_that_are_let_go_leave_no_thread_behind(
+    agent_file: Path, transitions: Transitions, tmp_path: Path, call: str
+) -> None:
+    """Not even where somebody has their folder removed; a logger that is held is not closed."""
+    gc.collect()
+    threads, held = threading.active_count(), list[Logger]()
+    for i in range(3):
+        agent = FAMLE.load(agent_file, device="cpu", **QUICK, joint_iterations=2, meta_iterations=2, inner_steps=1)
+        agent.tensorboard_log = str(tmp_path / str(i))
+        agent.learn(2) if call == "learn" else agent.meta_learn(transitions)
+        agent.get_env().close()
+        assert threading.active_count() > threads
+        if i == 1:
+            shutil.rmtree(tmp_path / "1")
+        if i == 2:
+            held.append(agent.logger)
+        del agent
+        gc.collect()
+        assert threading.active_count() == threads + len(held)
+    held[0].record("more", 1.0)
+    held[0].dump(1)
+    held.clear()
+    assert threading.active_count() == threads

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import pytest
 from benchmarks.fuzz import READERS, ReaderName, promised
 from benchmarks.interruptions import KINDS, WORKS, attempt
 from benchmarks.results import load
-from benchmarks.robustness import PARTS, Args, changed, main
+from benchmarks.robustness import PARTS, Args, Row, changed, environments, learning, main, repeated
 
 FOUND: dict[ReaderName, list[bytes]] = {
     "situation": [
@@ -87,6 +89,31 @@ def test_all_parts_are_tried_and_stored(tmp_path: Path, capsys: pytest.CaptureFi
     assert set(table["part"]) == set(parts)
     assert (table["wrong"] == 0).all()
     assert "make() and close()" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("part", [environments, pytest.param(learning, marks=pytest.mark.slow)])
+def test_robots_and_agents_are_let_go(part: Callable[[Args], Iterator[Row]]) -> None:
+    for row in part(Args(environments=16, learns=5)):
+        assert [line for line in row.wrong if "memory" not in line] == [], row.tried  # which takes longer to settle
+
+
+LEAKS: dict[str, Callable[[list[Any]], Any]] = {
+    "files": lambda held: Path(__file__).open(),  # noqa: SIM115
+    "objects": lambda held: [held],
+    "memory": lambda held: np.ones(2_000_000),
+    "nothing": lambda held: held,
+}
+
+
+@pytest.mark.parametrize("leak", LEAKS)
+def test_leaks_are_seen(leak: str) -> None:
+    held = list[Any]()
+    row = repeated("something", 10, lambda _: held.append(LEAKS[leak](held)))
+    assert bool(row.wrong) == (leak != "nothing")
+    assert leak == "nothing" or any(leak in line for line in row.wrong)
+    for one in held:
+        if leak == "files":
+            one.close()
 
 
 def test_nothing_else_can_be_tried() -> None:
