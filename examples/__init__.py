@@ -1,0 +1,1 @@
+"""Robots of your own: scripts to copy."""
