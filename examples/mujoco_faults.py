@@ -16,7 +16,12 @@ from famle_envs.faults import make_faulty
 
 ROBOT = "HalfCheetah-v5"
 SITUATIONS = ("intact", *(f"joint {joint} locked" for joint in range(6)), "friction x 0.3", "mass x 1.5")
-UNSEEN = ("joint 4 locked, mass x 1.5", "joint 0 locked, joint 3 locked", "joint 1 locked, friction x 0.3", "mass x 2.5")
+UNSEEN = (
+    "joint 4 locked, mass x 1.5",
+    "joint 0 locked, joint 3 locked",
+    "joint 1 locked, friction x 0.3",
+    "mass x 2.5",
+)
 
 
 def main(

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import tyro
 from gymnasium.envs.mujoco import MujocoEnv
@@ -32,9 +33,9 @@ class Arm(MujocoEnv):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 (as Gymnasium has it)
     angle_dims = (0, 1, 2)
 
-    def __init__(self, render_mode: str | None = None) -> None:
+    def __init__(self, **kwargs: Any) -> None:
         space = gym.spaces.Box(-np.inf, np.inf, (8,), np.float32)
-        super().__init__(str(MODEL), frame_skip=10, observation_space=space, render_mode=render_mode)
+        super().__init__(str(MODEL), frame_skip=10, observation_space=space, **kwargs)
 
     def observe(self) -> Any:
         """Returns the observation (8,)."""
@@ -42,14 +43,17 @@ class Arm(MujocoEnv):
 
     def reset_model(self) -> Any:
         """Puts the arm near its straight pose."""
-        self.set_state(self.np_random.uniform(-0.1, 0.1, 3), np.zeros(3))
+        self.data.qpos[:] = self.np_random.uniform(-0.1, 0.1, 3)
+        mujoco.mj_forward(self.model, self.data)
+        self.command = np.zeros(3)
         return self.observe()
 
     def step(self, action: Any) -> Any:
-        """Moves for 20 ms."""
-        before = self.observe()
-        self.do_simulation(action, self.frame_skip)
-        obs = self.observe()
+        """Moves for 20 ms; the command takes some of them to get there, as on a robot."""
+        before, late = self.observe(), self.np_random.integers(1, self.frame_skip)
+        self.do_simulation(self.command, late)
+        self.do_simulation(action, self.frame_skip - late)
+        self.command, obs = action, self.observe()
         return obs, float(self.reward_fn(before, action, obs)), False, False, {}
 
     @staticmethod
