@@ -10,8 +10,8 @@ import griffe
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parent.parent
-OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md", "benchmarks/NOTES.md", "benchmarks/report/*")
-"""Files of the repository that are pages and pictures of the site too."""
+OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md", "benchmarks/NOTES.md", "benchmarks/report/*", "examples/*.*")
+"""Files of the repository that are pages, pictures and scripts of the site too."""
 
 
 def on_files(files: Files, config: Any) -> Files:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,7 @@ def main(
         mind = FAMLE.load(agent, reward_fn=Arm.reward_fn, **SETTINGS, **changed)  # knows no simulator
         mind.save(out / f"{name}.zip")  # as it begins, for the replay
         with (
-            Robot() as robot,
+            closing(Robot()) as robot,
             switched_on(Device(robot.port, GAIN, BREAKS_AT, SILENT, seed=seed)),
             (out / f"{name}.jsonl").open("w") as file,
         ):

@@ -53,10 +53,10 @@ class Device:
         """Lives until no host has spoken for some time."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
             wire.bind((HOST, 0))
-            Arm(self, wire).run()
+            SimulatedArm(self, wire).run()
 
 
-class Arm:
+class SimulatedArm:
     """The arm of ``arm.xml`` and its firmware, in steps of the simulation.
 
     Args:

@@ -12,7 +12,6 @@ import socket
 import struct
 import time
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -148,6 +147,10 @@ class Robot:
                 return
         raise RobotLostError("The robot does not confirm that it has stopped: press the emergency stop.")
 
+    def close(self) -> None:
+        """Lets go of the port; the robot is not stopped."""
+        self._socket.close()
+
     def _send(self, order: Order, *action: float) -> None:
         if self.address is None:
             raise RobotLostError("The robot has not been heard of yet: call connect() first.")
@@ -163,11 +166,3 @@ class Robot:
                 heard, self._last, self.address = True, reading, address
                 self._began = time.monotonic()
         return heard
-
-    def __enter__(self) -> Robot:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._socket.close()

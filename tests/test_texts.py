@@ -81,6 +81,8 @@ def check_module(args: list[str]) -> None:
     if args[1].startswith("benchmarks."):
         module = importlib.import_module(args[1])
         tyro.cli(Report if args[1] == "benchmarks.reporting" else module.Args, args=args[2:])
+    elif args[1].startswith("examples."):
+        tyro.extras.get_parser(importlib.import_module(args[1]).main).parse_args(args[2:])
     else:
         assert importlib.util.find_spec(args[1]) is not None
         assert (ROOT / args[2]).exists()

@@ -31,6 +31,7 @@ def test_arm_with_two_faults_moves_on_with_adaptation(tmp_path: Path, capsys: py
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("tiny_budgets")
 def test_faults_of_a_mujoco_model_are_learnt_and_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     mujoco_faults.main(policy_steps=200, iterations=3, steps=15, out=tmp_path / "cheetah.zip")
     out = capsys.readouterr().out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -85,7 +86,7 @@ def test_robot_is_stopped_where_something_goes_wrong(arm_agent: FAMLE, tmp_path:
 
 def test_robot_that_dies_is_noticed(arm_agent: FAMLE, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(real_robot, "GIVE_UP", 4)
-    with Robot() as robot, switched_on(Device(robot.port)) as process:
+    with closing(Robot()) as robot, switched_on(Device(robot.port)) as process:
         robot.connect()
         process.kill()
         process.wait()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from subprocess import Popen
 from typing import Any
 
@@ -20,7 +20,7 @@ FORWARD = np.array([1.0, 0.0, 0.0], dtype=np.float32)
 
 @pytest.fixture
 def robot() -> Iterator[Robot]:
-    with Robot() as robot:
+    with closing(Robot()) as robot:
         yield robot
 
 
