@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -39,7 +38,7 @@ class GaitEnv(RobotEnv):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012 (Gymnasium's own type)
 
-    supported_faults = frozenset({"locked_joints", "orientation_error", "friction", "base_mass"})
+    supported_faults = frozenset({"locked_joints", "orientation_error", "friction", "base_mass", "motor_strength"})
     task_arguments = RobotEnv.task_arguments | {"profile"}
     time_step = 0.01
     physics_steps = 100
@@ -54,7 +53,11 @@ class GaitEnv(RobotEnv):
     position_gain: ClassVar[float] = 0.1
     """Part of the angle's error that a servo would make good in one physics step."""
     rest_angles: ClassVar[Array]
-    """Joint angles of the robot at rest, (n_joints,); a blocked joint is held there."""
+    """Joint angles of the robot at rest in rad, (n_joints,); a blocked joint is held there."""
+    swing_angles: ClassVar[Array]
+    """What a swing of 1 of each leg adds to the joint angles, in rad, (4, n_joints)."""
+    lift_angles: ClassVar[Array]
+    """What a lift of 1 of each leg adds to them, (4, n_joints)."""
     profiles: ClassVar[Mapping[str, Profile]]
     """Profiles by name, beside the simulator."""
 
@@ -74,9 +77,9 @@ class GaitEnv(RobotEnv):
         self._times = self.time_step * np.arange(self.physics_steps)
         super().__init__(situation=situation, engine=engine, render_mode=render_mode)
 
-    @abstractmethod
     def _joint_targets(self, swing: Array, lift: Array) -> Array:
         """Joint angles in rad, (n, n_joints), that give each leg the swings and lifts (n, 4) of a gait."""
+        return self.rest_angles + lift @ self.lift_angles + swing @ self.swing_angles
 
     @property
     def position(self) -> Point:
@@ -139,7 +142,7 @@ class GaitEnv(RobotEnv):
         super()._apply_situation()
         profile, situation = self.profile, self._situation
         self._blocked = list(situation.locked_joints)
-        self._torques = np.full(len(self.joints), profile.motor_strength * self.motor_torque)
+        self._torques = profile.motor_strength * self.motor_torque * np.array(situation.motor_strength)
         self._torques[self._blocked] = HOLDING_TORQUE
         self.world.scale_masses(profile.base_mass * situation.base_mass, profile.leg_mass)
         self.world.add_damping(profile.joint_damping)

@@ -86,7 +86,8 @@ class MinitaurEnv(GaitEnv):
     60 actions. It ends where the robot has fallen (tilted by 50 degrees).
 
     ## Situations
-    ``friction`` and ``base_mass``, ``locked_joints`` (held at their angle at rest) and ``orientation_error``.
+    ``friction`` and ``base_mass``, ``locked_joints`` (held at their angle at rest), ``motor_strength`` and
+    ``orientation_error``.
     :attr:`training_situations` holds the paper's nine: friction x {0.5, 1, 2} and base mass x {1, 1.5, 2}.
 
     Args:
@@ -111,6 +112,8 @@ class MinitaurEnv(GaitEnv):
     motor_speed = 6.0
     position_gain = 0.05
     rest_angles = _REST * np.repeat(_LEG_SIDE, 2)
+    swing_angles = _FULL_SWING * np.kron(np.eye(len(_LEG_SIDE)), [-1.0, 1.0])
+    lift_angles = -_FULL_LIFT * np.kron(np.diag(_LEG_SIDE), [1.0, 1.0])
     profiles: ClassVar[Mapping[str, Profile]] = {HELD_OUT.name: HELD_OUT}
     angle_dims = (3, 4)
     pose_dims = (0, 1, 5)
@@ -152,11 +155,6 @@ class MinitaurEnv(GaitEnv):
         """
         tilt = (abs(next_obs[..., 3:5]) - 0.15).clip(min=0.0).sum(-1)
         return self.reward_fn(obs, action, next_obs) - tilt
-
-    def _joint_targets(self, swing: Array, lift: Array) -> Array:
-        length = _LEG_SIDE * (_REST - _FULL_LIFT * lift)
-        forwards = -_FULL_SWING * swing
-        return np.stack([length + forwards, length - forwards], axis=2).reshape(len(swing), len(_SIDES))
 
     def observe(self) -> Array:
         """Returns the observation as the sensors give it."""

@@ -248,7 +248,8 @@ class RobotEnv(gym.Env[Array, Array]):
         self._locked_at = {joint: float(angles[joint]) for joint in self._situation.locked_joints}
         self._label = self._situation.label
         if self.render_mode is not None:
-            weak = {joint for joint, gain in enumerate(self._situation.motor_gain) if gain != 1.0}
+            motors = zip(self._situation.motor_gain, self._situation.motor_strength, strict=True)
+            weak = {joint for joint, factors in enumerate(motors) if factors != (1.0, 1.0)}
             self.world.paint(frozenset(weak | set(self._locked_at)))
 
     def _info(self) -> dict[str, Any]:

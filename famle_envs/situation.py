@@ -19,8 +19,8 @@ class Situation:
     """A circumstance that perturbs the dynamics of a robot. Immutable, hashable, comparable.
 
     Joints, motors, sensors and bodies are counted from 0; one beyond the end of a tuple is as built, of which
-    ``motor_gain`` has to say so (``partial``). The robots of famle_envs have the first six faults;
-    :mod:`famle_envs.faults` puts all others, and most of these, into any robot.
+    ``motor_gain`` has to say so (``partial``). The robots of famle_envs have the first six faults, those that walk by
+    gaits ``motor_strength`` too; :mod:`famle_envs.faults` puts all others, and most of these, into any robot.
     Two situations are equal when the same things are wrong: the name is a label and takes no part in it.
 
     Args:
