@@ -13,11 +13,13 @@ __all__ = ["ENGINES", "make_world", "resolve_engine"]
 ENGINES = ("pybullet", "mujoco")
 """The engines by the names of the packages that they need; the first one that is installed is the default."""
 
+_WITH_PYBULLET = '`pip install "famle[pybullet]"`, which needs a compiler where PyBullet has no wheel.'
 _REMEDIES = {
-    "pybullet": '`pip install "famle[pybullet]"`, which needs a compiler where PyBullet has no wheel. '
-    "Without the argument `engine`, the robot runs in the engine that is installed.",
+    "pybullet": f"{_WITH_PYBULLET} Without the argument `engine`, the robot runs in the engine that is installed.",
+    "pybullet_data": f"{_WITH_PYBULLET} It describes this robot to each engine.",
     "mujoco": "`pip install mujoco`.",
 }
+"""What to do where a package is not installed, by its name."""
 
 
 def resolve_engine(name: str | None) -> str:
@@ -43,7 +45,7 @@ def make_world(engine: str, body: Body, steps: Steps, marker: Marker | None) -> 
         marker: What pictures show beside the robot.
 
     Raises:
-        gymnasium.error.DependencyNotInstalled: The engine is not installed.
+        gymnasium.error.DependencyNotInstalled: The engine, or the package that describes the robot, is not installed.
     """
     try:
         if engine == "pybullet":
@@ -54,6 +56,6 @@ def make_world(engine: str, body: Body, steps: Steps, marker: Marker | None) -> 
 
         return MujocoWorld(body, steps, marker)
     except ModuleNotFoundError as error:
-        if error.name != engine:
+        if error.name not in _REMEDIES:
             raise
-        raise gym.error.DependencyNotInstalled(f"{engine} is not installed: {_REMEDIES[engine]}") from error
+        raise gym.error.DependencyNotInstalled(f"{error.name} is not installed: {_REMEDIES[error.name]}") from error

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import as_file, files
 from typing import Any
 
@@ -73,6 +73,7 @@ class BulletWorld:
             link: pybullet.getDynamicsInfo(self.robot, link, physicsClientId=client)
             for link in (_BASE, *self._links.values())
         }
+        self._base_in_mass = _frame_in_mass(self._as_built[_BASE])
         self._damping_as_built = [
             pybullet.getJointInfo(self.robot, joint, physicsClientId=client)[6] for joint in self.joints
         ]
@@ -82,9 +83,8 @@ class BulletWorld:
         self._colours = {(link, links[:i].count(link)): shapes[i][7] for i, link in enumerate(links)}
 
     def _load(self, body: Body) -> int:
-        own = _OWN_DESCRIPTIONS.get(body.description)
         flags = 0 if body.description in _INERTIA_OF_SHAPES else pybullet.URDF_USE_INERTIA_FROM_FILE
-        with as_file(own or files("famle_envs") / "assets" / body.description) as path:
+        with as_file(_OWN_DESCRIPTIONS.get(body.description) or body.urdf) as path:
             robot = pybullet.loadURDF(
                 str(path),
                 (0.0, 0.0, body.height),
@@ -150,6 +150,8 @@ class BulletWorld:
 
     def base_pose(self) -> tuple[Point, Quaternion]:
         position, quaternion = pybullet.getBasePositionAndOrientation(self.robot, physicsClientId=self.client)
+        if self._base_in_mass is not None:
+            position, quaternion = pybullet.multiplyTransforms(position, quaternion, *self._base_in_mass)
         return position, quaternion
 
     def base_velocity(self) -> tuple[Point, Point]:
@@ -237,3 +239,16 @@ class BulletWorld:
             physicsClientId=self.client,
         )
         return np.asarray(pixels, dtype=np.uint8).reshape(PICTURE_SIZE, PICTURE_SIZE, 4)[:, :, :3].copy()
+
+
+def _frame_in_mass(dynamics: Sequence[Any]) -> tuple[Point, Quaternion] | None:
+    """A link's frame as seen from its centre of mass and principal axes, of which PyBullet tells; None where all agree.
+
+    Args:
+        dynamics: What ``getDynamicsInfo`` says of the link.
+    """
+    centre, axes = dynamics[3:5]
+    if (*centre, *axes) == (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0):
+        return None
+    position, quaternion = pybullet.invertTransform(centre, axes)
+    return position, quaternion

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from importlib.resources import files
+from importlib.resources import as_file
 from xml.etree import ElementTree
 
 import mujoco
@@ -53,9 +53,9 @@ class MujocoWorld:
     """
 
     def __init__(self, body: Body, steps: Steps, marker: Marker | None) -> None:
-        file = files("famle_envs") / "assets" / body.description
-        description = ElementTree.fromstring(file.read_text(encoding="utf-8"))
-        self.model = compile_model(description, body, marker)
+        with as_file(body.urdf) as file:
+            description = ElementTree.parse(file).getroot()
+            self.model = compile_model(description, file.parent, body, marker)
         self.data = mujoco.MjData(self.model)
         self._set_laws(steps)
         self._substeps = steps.substeps

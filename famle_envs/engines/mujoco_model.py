@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -19,11 +20,12 @@ SEEN = 1  # the group of the shapes in a picture; those that collide are in grou
 _FLOOR_COLOURS, _SKY_COLOUR = ((0.93, 0.93, 0.93), (0.63, 0.72, 0.93)), (1.0, 1.0, 1.0)
 
 
-def compile_model(description: ElementTree.Element, body: Body, marker: Marker | None) -> Any:
+def compile_model(description: ElementTree.Element, folder: Path, body: Body, marker: Marker | None) -> Any:
     """Compiles a robot and what stands around it.
 
     Args:
         description: The root of the robot's URDF.
+        folder: That of the URDF, to which the names of meshes are relative.
         body: What the URDF does not say.
         marker: What one sees beside the robot.
 
@@ -31,7 +33,8 @@ def compile_model(description: ElementTree.Element, body: Body, marker: Marker |
         The ``mujoco.MjModel``.
     """
     extension = ElementTree.SubElement(description, "mujoco")
-    ElementTree.SubElement(extension, "compiler", discardvisual="false", fusestatic="false")
+    kept = {"discardvisual": "false", "fusestatic": "false", "strippath": "false", "meshdir": str(folder)}
+    ElementTree.SubElement(extension, "compiler", kept)
     spec = mujoco.MjSpec.from_string(ElementTree.tostring(description, encoding="unicode"))
     world, seen = spec.worldbody, {"group": SEEN, "contype": 0, "conaffinity": 0}
     base = world.first_body()

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeAlias
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from importlib.resources.abc import Traversable
 
 __all__ = ["FAULTY_COLOUR", "HOLDING_TORQUE", "PICTURE_SIZE", "Array", "Body", "Camera", "Marker", "Steps", "World"]
 
@@ -30,11 +34,12 @@ class Body:
     """A robot: its description, and what a URDF cannot say.
 
     Attributes:
-        description: A file in ``famle_envs/assets``: masses, lengths, joints, and how the links touch the floor.
+        description: A URDF: masses, lengths, joints, and how the links touch the floor.
         joints: The motorised joints, in the order in which all arrays name them. All other joints turn freely.
         fixed: Whether the base is bolted down, where there is no floor. Else it starts at ``height`` above one, in m.
         start_angles: Of joints that do not start at zero, in rad.
         loops: Pairs of links that meet in a point, each (link, point in its frame) twice.
+        package: Where the description is, with the meshes beside it; read when a robot is made.
     """
 
     description: str
@@ -43,6 +48,16 @@ class Body:
     height: float = 0.0
     start_angles: Mapping[str, float] = field(default_factory=dict)
     loops: tuple[tuple[tuple[str, Point], tuple[str, Point]], ...] = ()
+    package: str = "famle_envs.assets"
+
+    @property
+    def urdf(self) -> Traversable:
+        """The description's file.
+
+        Raises:
+            ModuleNotFoundError: The package is not installed.
+        """
+        return files(self.package) / self.description
 
 
 @dataclass(frozen=True)
