@@ -15,6 +15,7 @@ import famle_envs  # noqa: F401 (registers the robots)
 from benchmarks import ppo
 from famle_agent import FAMLE, Transitions
 from famle_agent.agents.presets import known_robots
+from famle_envs.a1 import A1Env
 from famle_envs.engines import ENGINES
 from tests.helpers import skip_what_cannot_be_drawn
 from tests.small_reacher import EPISODE, REDUCED, SMALL_ROLLOUTS
@@ -49,6 +50,9 @@ SMALL: dict[str, Any] = {
 
 QUICK: dict[str, Any] = {"adapt_every": 5, "adapt_steps": 2, "candidates": 20, "planner_iterations": 1}
 """Settings of a loaded agent for tests that need it to run and not to be good."""
+
+
+_OF_THE_A1 = {"a1", "FamleA1-v0", "famle_envs.a1", str(A1Env)}
 
 
 @pytest.fixture(scope="session")
@@ -101,6 +105,14 @@ def engine(request: pytest.FixtureRequest) -> str:
     """The name of each engine that is installed."""
     pytest.importorskip(request.param)
     return str(request.param)
+
+
+@pytest.fixture(autouse=True)
+def _described(request: pytest.FixtureRequest) -> None:
+    """Skips what is about the A1 where PyBullet, which describes it, is not installed."""
+    parameters = getattr(request.node, "callspec", None)
+    if parameters is not None and any(str(value) in _OF_THE_A1 for value in parameters.params.values()):
+        pytest.importorskip("pybullet_data")
 
 
 @pytest.fixture

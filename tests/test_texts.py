@@ -200,6 +200,7 @@ def test_readme_is_short_and_plain() -> None:
         "famle_envs.reacher",
         "famle_envs.ant",
         "famle_envs.quadruped",
+        "famle_envs.a1",
         "famle_envs.minitaur",
     ],
 )

@@ -73,8 +73,10 @@ def known_robots() -> dict[str, Robot]:
     entries = {name: yaml.safe_load(folder.joinpath(f"{name}.yaml").read_text()) for name in names}
     any_robot = entries["default"]
     robots = {}
-    for name, entry in entries.items():
-        # A file says only what differs: of how any robot adapts, of the paper's settings, of the paper's for this one.
+    for name, own in entries.items():
+        # A file says only what differs: from a robot that it is like, section by section; of how any robot adapts, of
+        # the paper's settings, of the paper's for this one.
+        entry = entries[own["like"]] | own if "like" in own else own
         ours, paper = (any_robot[of_any] | entry[mode] for of_any, mode in (("adaptation", "ours"), ("paper", "paper")))
         modes = {"ours": ours, "paper": paper}
         if "original" in entry:

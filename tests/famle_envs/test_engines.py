@@ -24,6 +24,7 @@ from gymnasium.utils.env_checker import check_env as check_with_gymnasium
 from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
 from famle_agent import FAMLE
+from famle_envs.a1 import A1Env
 from famle_envs.ant import AntEnv
 from famle_envs.engines import ENGINES, make_world, resolve_engine
 from famle_envs.engines.world import World
@@ -41,14 +42,16 @@ ROBOTS: dict[str, type[RobotEnv]] = {
     "FamleReacher-v0": ReacherEnv,
     "FamleAnt-v0": AntEnv,
     "FamleQuadruped-v0": QuadrupedEnv,
+    "FamleA1-v0": A1Env,
     "FamleMinitaur-v0": MinitaurEnv,
 }
-ON_A_FLOOR = ["FamleAnt-v0", "FamleQuadruped-v0", "FamleMinitaur-v0"]
-GAIT_ROBOTS = ["FamleQuadruped-v0", "FamleMinitaur-v0"]
+GAIT_ROBOTS = ["FamleQuadruped-v0", "FamleA1-v0", "FamleMinitaur-v0"]
+ON_A_FLOOR = ["FamleAnt-v0", *GAIT_ROBOTS]
 FAULTY = {
     "FamleReacher-v0": "joint 1 locked, joint 3 dead",
     "FamleAnt-v0": "joint 2 locked, friction x 0.3",
     "FamleQuadruped-v0": "joint 4 locked, friction x 0.5, base mass x 1.5",
+    "FamleA1-v0": "joint 4 locked, motor 7 strength x 0.2, friction x 0.5, base mass x 1.5",
     "FamleMinitaur-v0": "joint 4 locked, friction x 0.5, base mass x 1.5",
 }
 NO_BULLET = """
@@ -93,7 +96,7 @@ def run(code: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_no_engine_is_imported_before_a_robot_is_made() -> None:
-    modules = "famle_envs, famle_envs.ant, famle_envs.minitaur, famle_envs.quadruped, famle_envs.reacher"
+    modules = "famle_envs, famle_envs.a1, famle_envs.ant, famle_envs.minitaur, famle_envs.quadruped, famle_envs.reacher"
     done = run(f"import sys, {modules}; print([name for name in ('pybullet', 'mujoco') if name in sys.modules])")
     assert done.stdout.strip() == "[]", done.stderr
 
@@ -116,7 +119,7 @@ def test_unknown_engine_is_refused(env_id: str, name: Any) -> None:
         ROBOTS[env_id](engine=name)
 
 
-@pytest.mark.parametrize("robot", list(ROBOTS))
+@pytest.mark.parametrize("robot", [robot for robot in ROBOTS if robot != "FamleA1-v0"])
 def test_robot_without_pybullet_runs_in_mujoco(robot: str) -> None:
     done = run(
         f"{NO_BULLET}\nimport gymnasium as gym, famle_envs\nenv = gym.make({robot!r})\n"
@@ -130,6 +133,12 @@ def test_missing_pybullet_is_refused_with_the_remedy() -> None:
     assert "DependencyNotInstalled" in done.stderr
     assert 'pip install "famle[pybullet]"' in done.stderr
     assert "compiler" in done.stderr
+
+
+def test_robot_that_pybullet_describes_is_refused_without_it_with_the_remedy() -> None:
+    done = run(f"{NO_BULLET}\nimport gymnasium as gym, famle_envs\ngym.make('FamleA1-v0', engine='mujoco')")
+    assert "DependencyNotInstalled: pybullet_data is not installed" in done.stderr
+    assert 'pip install "famle[pybullet]"' in done.stderr
 
 
 def test_opengl_does_not_load_its_llvm_before_that_of_triton(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 
 from famle_agent import FAMLE
+from famle_envs.a1 import A1Env
 from famle_envs.gait_env import GaitEnv
 from famle_envs.minitaur import MinitaurEnv
 from famle_envs.profile import SIMULATOR, Profile, resolve_profile
@@ -21,7 +22,7 @@ from tests.worlds import inertias, masses
 Make = Callable[..., QuadrupedEnv]
 
 STAND, FORWARDS = np.array([0.0, 0.0, -1.0, 0.0]), np.array([0.0, 1.0, 0.0, 0.0])
-ROBOTS: list[type[GaitEnv]] = [QuadrupedEnv, MinitaurEnv]
+ROBOTS: list[type[GaitEnv]] = [QuadrupedEnv, A1Env, MinitaurEnv]
 
 
 @pytest.fixture

@@ -191,6 +191,7 @@ def test_learned_reward_sees_where_the_robot_is() -> None:
         ("FamleReacher-v0", ((0, 1, 2, 3, 4), (), ())),
         ("FamleAnt-v0", ((), (1, 2, 3, 4), ())),
         ("FamleQuadruped-v0", ((), (), (0, 1, 2, 3))),
+        ("FamleA1-v0", ((), (), (0, 1, 2, 3))),
         ("FamleMinitaur-v0", ((3, 4), (), (0, 1, 5))),
     ],
 )
