@@ -1,6 +1,7 @@
-"""The quadruped on held-out dynamics: the paper's table I.
+"""The quadruped and the A1 on held-out dynamics: the paper's table I.
 
 python -m benchmarks.quadruped                                     # yaw error, blocked leg, both, yaw error on the way
+python -m benchmarks.quadruped --robot a1 --experiments leg both    # the same of the A1
 python -m benchmarks.quadruped --experiments gap-home gap-held-out  # what one simulator alone teaches
 
 Replicates share the shipped model, and the other agents theirs; each has its own seed of the robot and the planner, and
@@ -12,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -22,15 +24,18 @@ from benchmarks.task import Task
 from famle_agent import FAMLEWrapper
 from famle_agent.rollout import rollout
 from famle_envs import Situation
-from famle_envs.quadruped import HELD_OUT, LEGS, blocked_leg
+from famle_envs.goal_walker import LEGS, blocked_leg
+from famle_envs.quadruped import HELD_OUT
 
 YAW = math.radians(30)
 
 
 @dataclass(frozen=True)
 class Args(Options):
-    """The quadruped on held-out dynamics: the paper's table I."""
+    """The quadruped and the A1 on held-out dynamics: the paper's table I."""
 
+    robot: Literal["quadruped", "a1"] = "quadruped"
+    """Which of them; the report has sections for leg and both of the A1."""
     experiments: tuple[str, ...] = ("yaw", "leg", "both", "later")
     """Some of yaw, leg, both, later, and gap-home, gap-held-out for the intact robot in both."""
     replicates: int = 12
@@ -46,7 +51,7 @@ def task_of(experiment: str, seed: int, args: Args) -> Task:
         "both": Situation(locked_joints=leg.locked_joints, orientation_error=YAW),
     }
     profile = "simulator" if experiment == "gap-home" else HELD_OUT.name
-    task = Task("quadruped", seed, wrong.get(experiment, Situation()), args.cache, profile)
+    task = Task(args.robot, seed, wrong.get(experiment, Situation()), args.cache, profile)
     return replace(task, later=wrong["yaw"], strikes_at=5) if experiment == "later" else task
 
 
@@ -77,7 +82,7 @@ def main(args: Args) -> None:
     """Runs and reports."""
     for experiment in args.experiments:
         tasks = [task_of(experiment, seed, args) for seed in range(args.replicates)]
-        run_experiment(f"quadruped-{experiment}", tasks, run, args)
+        run_experiment(f"{args.robot}-{experiment}", tasks, run, args)
 
 
 if __name__ == "__main__":

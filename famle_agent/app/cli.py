@@ -21,9 +21,9 @@ __all__ = ["main", "read_command"]
 
 @dataclass(frozen=True)
 class Demo:
-    """Break a robot and watch it adapt: arm and ant in simulation, quadruped and Minitaur on held-out dynamics."""
+    """Break a robot and watch it adapt: arm and ant in simulation, robots with gaits on held-out dynamics."""
 
-    robot: Literal["reacher", "ant", "quadruped", "minitaur"] = "reacher"
+    robot: Literal["reacher", "ant", "quadruped", "a1", "minitaur"] = "reacher"
     """The robot."""
     situation: str = ""
     """What breaks: a preset or a description such as "joint 0 reversed, joint 3 dead"; by default the robot's own."""

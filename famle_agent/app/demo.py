@@ -262,10 +262,13 @@ def _draw_path(runs: Runs, env: gym.Env[Any, Any], out: Path) -> None:
     plot_paths(paths, title, out / "path.png", goal)
 
 
+_TO_A_GOAL = Demo("paper", (0, 0), 1, _draw_path, {"profile": "held-out"})
+
 DEMOS: Mapping[str, Demo] = {
     "reacher": Demo("paper", (1, 0), 6, _draw_returns),
     "ant": Demo("joint 2 dead, yaw sensor off by 60 deg", (0, 300), 1, _draw_speed, {"max_episode_steps": 900}),
-    "quadruped": Demo("paper", (0, 0), 1, _draw_path, {"profile": "held-out"}),
+    "quadruped": _TO_A_GOAL,
+    "a1": _TO_A_GOAL,
     "minitaur": Demo("intact", (0, 0), 1, _draw_path, {"profile": "held-out"}),
 }
 """What is shown of each robot."""

@@ -11,7 +11,7 @@ from famle_agent.agents.presets import known_robots
 from famle_agent.rollout import rollout
 
 MakeEnv = Callable[..., gym.Env[Any, Any]]
-ROBOTS = {"quadruped": 20, "minitaur": 9}
+ROBOTS = {"quadruped": 20, "a1": 20, "minitaur": 9}
 
 
 @pytest.mark.parametrize(("robot", "n_situations"), ROBOTS.items())
@@ -24,7 +24,7 @@ def test_package_ships_a_small_model_of_these_settings(robot: str, n_situations:
     assert agent.situations[0] == "intact"
     file = known_robots()[robot].pretrained
     assert file is not None
-    assert len(file.read_bytes()) < 2_000_000
+    assert len(file.read_bytes()) < 400_000
 
 
 @pytest.mark.parametrize("robot", ROBOTS)

@@ -193,7 +193,7 @@ def test_demo_shows_the_way_to_the_goal(tmp_path: Path, capsys: pytest.CaptureFi
 @pytest.mark.parametrize(
     ("robot", "wrong", "message"),
     [
-        ("octopus", {}, "demo of reacher, ant, quadruped, minitaur, not of 'octopus'"),
+        ("octopus", {}, "demo of reacher, ant, quadruped, a1, minitaur, not of 'octopus'"),
         ("ant", {"situation": "joint 9 dead"}, "joint"),
         ("ant", {"breaks_at": (0, 900)}, r"within 1 episodes of 900 steps; got \(0, 900\)"),
         ("ant", {"breaks_at": (1, 0)}, "breaks_at"),
