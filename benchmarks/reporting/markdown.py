@@ -275,6 +275,8 @@ _SHORT: Sequence[tuple[str, str, str, Callable[[Row], str]]] = (
     ),
     ("quadruped-leg", "quadruped, a leg blocked", "reaches its goal, gaits", _success),
     ("quadruped-both", "quadruped, a leg blocked and a wrong compass", "reaches its goal, gaits", _success),
+    ("a1-leg", "Unitree A1, a leg blocked", "reaches its goal, gaits", _success),
+    ("a1-both", "Unitree A1, a leg blocked and a wrong compass", "reaches its goal, gaits", _success),
     ("minitaur-held-out", "Minitaur, nothing broken", "metres in 60 gaits", partial(_median, key="distance")),
 )
 """The experiment, what is broken, what is measured and the cell of each row of the table for a first look."""

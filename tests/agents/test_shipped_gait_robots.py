@@ -12,6 +12,7 @@ from famle_agent.rollout import rollout
 
 MakeEnv = Callable[..., gym.Env[Any, Any]]
 ROBOTS = {"quadruped": 20, "a1": 20, "minitaur": 9}
+TO_A_GOAL = ["quadruped", "a1"]
 
 
 @pytest.mark.parametrize(("robot", "n_situations"), ROBOTS.items())
@@ -33,11 +34,10 @@ def test_shipped_model_serves_held_out_dynamics(robot: str, make_env: MakeEnv) -
     assert FAMLE(env, device="cpu").dynamics is not None
 
 
-def test_shipped_model_serves_any_goal(make_env: MakeEnv) -> None:
-    agent = FAMLE("quadruped", seed=0, device="cpu")
-    agent.get_env().close()
+@pytest.mark.parametrize("robot", TO_A_GOAL)
+def test_shipped_model_serves_any_goal(robot: str, make_env: MakeEnv) -> None:
     for goal in ((0.0, 1.0), (-1.0, -0.5)):
-        env = make_env("FamleQuadruped-v0", goal=goal)
+        env = make_env(known_robots()[robot].env_id, goal=goal)
         served = FAMLE(env, seed=0, device="cpu")
         run = rollout(FAMLEWrapper(env, served), seed=0)
         assert run.success
@@ -45,11 +45,12 @@ def test_shipped_model_serves_any_goal(make_env: MakeEnv) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("robot", TO_A_GOAL)
 @pytest.mark.parametrize("situation", ["back right leg blocked", "yaw sensor off by 30 deg"])
-def test_quadruped_reaches_its_goal_on_held_out_dynamics(situation: str, make_env: MakeEnv) -> None:
-    agent = FAMLE("quadruped", seed=0, device="cpu")
+def test_robot_reaches_its_goal_on_held_out_dynamics(robot: str, situation: str, make_env: MakeEnv) -> None:
+    agent = FAMLE(robot, seed=0, device="cpu")
     agent.get_env().close()
-    env = make_env("FamleQuadruped-v0", situation=situation, profile="held-out")
+    env = make_env(known_robots()[robot].env_id, situation=situation, profile="held-out")
     assert rollout(FAMLEWrapper(env, agent), seed=0).success
 
 

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -17,16 +17,23 @@ from famle_envs import Situation
 from famle_envs.quadruped import QuadrupedEnv
 
 
-def test_tests_are_run_on_held_out_dynamics_and_on_damage_that_no_training_situation_has() -> None:
+@pytest.mark.parametrize("robot", ["quadruped", "a1"])
+def test_tests_are_run_on_held_out_dynamics_and_on_damage_that_no_training_situation_has(
+    robot: Literal["quadruped", "a1"],
+) -> None:
+    args = quadruped.Args(robot=robot)
     for experiment in ("yaw", "leg", "both", "later"):
         for seed in range(4):
-            task = quadruped.task_of(experiment, seed, quadruped.Args())
-            assert task.profile == "held-out"
+            task = quadruped.task_of(experiment, seed, args)
+            assert (task.robot, task.profile) == (robot, "held-out")
             test = task.later or task.situation
             assert test not in QuadrupedEnv.training_situations
             assert not test.is_intact
-    legs = {quadruped.task_of("leg", seed, quadruped.Args()).situation.locked_joints for seed in range(12)}
+    legs = {quadruped.task_of("leg", seed, args).situation.locked_joints for seed in range(12)}
     assert legs == {(0, 1, 2), (3, 4, 5), (6, 7, 8), (9, 10, 11)}
+
+
+def test_minitaur_is_tested_on_held_out_dynamics_too() -> None:
     assert minitaur.task_of("held-out", 0, minitaur.Args()).profile == "held-out"
     assert minitaur.task_of("home", 0, minitaur.Args()).profile == "simulator"
 
@@ -47,7 +54,7 @@ def test_replicate_is_stored_with_its_profile_and_summed_up(tmp_path: Path, caps
     assert all(style_of(method).label in shown for method in ("famle", "famle-frozen"))
 
 
-@pytest.mark.parametrize("robot", ["quadruped", "minitaur"])
+@pytest.mark.parametrize("robot", ["quadruped", "a1", "minitaur"])
 @pytest.mark.parametrize("method", ["famle", "famle-frozen", "famle-nearest", "famle-likeliest"])
 def test_methods_are_the_shipped_agent_with_something_changed(robot: str, method: str, tmp_path: Path) -> None:
     agent: Any = METHODS[method].agent(Task(robot, 3, Situation(), tmp_path, "held-out"))
