@@ -8,7 +8,7 @@ import gymnasium as gym
 
 from famle_envs.engines.world import Body, Marker, Steps, World
 
-__all__ = ["ENGINES", "make_world", "resolve_engine"]
+__all__ = ["ENGINES", "MissingPackageError", "make_world", "resolve_engine"]
 
 ENGINES = ("pybullet", "mujoco")
 """The engines by the names of the packages that they need; the first one that is installed is the default."""
@@ -20,6 +20,10 @@ _REMEDIES = {
     "mujoco": "`pip install mujoco`.",
 }
 """What to do where a package is not installed, by its name."""
+
+
+class MissingPackageError(gym.error.DependencyNotInstalled, ModuleNotFoundError):
+    """A package that a robot needs is not installed: an error of Gymnasium's kind and of Python's."""
 
 
 def resolve_engine(name: str | None) -> str:
@@ -45,7 +49,7 @@ def make_world(engine: str, body: Body, steps: Steps, marker: Marker | None) -> 
         marker: What pictures show beside the robot.
 
     Raises:
-        gymnasium.error.DependencyNotInstalled: The engine, or the package that describes the robot, is not installed.
+        MissingPackageError: The engine, or the package that describes the robot, is not installed.
     """
     try:
         if engine == "pybullet":
@@ -58,4 +62,4 @@ def make_world(engine: str, body: Body, steps: Steps, marker: Marker | None) -> 
     except ModuleNotFoundError as error:
         if error.name not in _REMEDIES:
             raise
-        raise gym.error.DependencyNotInstalled(f"{error.name} is not installed: {_REMEDIES[error.name]}") from error
+        raise MissingPackageError(f"{error.name} is not installed: {_REMEDIES[error.name]}") from error

@@ -92,6 +92,14 @@ def run(code: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
 
 
+def refused(robot: str, engine: str) -> str:
+    """Code that prints why a robot cannot be made without PyBullet."""
+    return (
+        f"{NO_BULLET}\nimport gymnasium as gym, famle_envs\ntry:\n    gym.make({robot!r}, engine={engine!r})\n"
+        "except gym.error.DependencyNotInstalled as error:\n    print(error)"
+    )
+
+
 # --- Choosing an engine ---
 
 
@@ -129,16 +137,23 @@ def test_robot_without_pybullet_runs_in_mujoco(robot: str) -> None:
 
 
 def test_missing_pybullet_is_refused_with_the_remedy() -> None:
-    done = run(f"{NO_BULLET}\nimport gymnasium as gym, famle_envs\ngym.make('FamleAnt-v0', engine='pybullet')")
-    assert "DependencyNotInstalled" in done.stderr
-    assert 'pip install "famle[pybullet]"' in done.stderr
-    assert "compiler" in done.stderr
+    done = run(refused("FamleAnt-v0", "pybullet"))
+    assert done.stdout.startswith("pybullet is not installed"), done.stderr
+    assert 'pip install "famle[pybullet]"' in done.stdout
+    assert "compiler" in done.stdout
 
 
 def test_robot_that_pybullet_describes_is_refused_without_it_with_the_remedy() -> None:
-    done = run(f"{NO_BULLET}\nimport gymnasium as gym, famle_envs\ngym.make('FamleA1-v0', engine='mujoco')")
-    assert "DependencyNotInstalled: pybullet_data is not installed" in done.stderr
-    assert 'pip install "famle[pybullet]"' in done.stderr
+    done = run(refused("FamleA1-v0", "mujoco"))
+    assert done.stdout.startswith("pybullet_data is not installed"), done.stderr
+    assert 'pip install "famle[pybullet]"' in done.stdout
+
+
+def test_command_without_what_its_robot_needs_ends_with_the_remedy(tmp_path: Path) -> None:
+    command = ["demo", "--robot", "a1", "--out", str(tmp_path)]
+    done = run(f"{NO_BULLET}\nfrom famle_agent.app.cli import main\nmain({command})")
+    assert done.returncode == 2
+    assert done.stderr.startswith("famle: pybullet_data is not installed"), done.stderr
 
 
 def test_opengl_does_not_load_its_llvm_before_that_of_triton(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
