@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from benchmarks.ablations import PIECES, Args, main, robots, summary
+from benchmarks.results import load
+
+
+def test_pieces_are_compared_pair_by_pair() -> None:
+    rows = [("all", 0, 3.0), ("all", 1, 5.0), ("frozen", 0, 1.0), ("frozen", 1, 2.0)]
+    found = summary(pd.DataFrame(rows, columns=["method", "seed", "score"]))
+    assert list(found.index) == ["all", "frozen"]
+    assert found.loc["frozen"].to_dict() == {"mean": 1.5, "median": 1.5, "less all": -2.5, "+-": 0.5}
+    assert found.loc["all", "less all"] == 0.0
+
+
+@pytest.mark.parametrize("robot", ["ant", "quadruped", "minitaur"])
+def test_every_piece_can_be_taken_from_a_robot(robot: str, tmp_path: Path) -> None:
+    chosen = robots(tmp_path)[robot]
+    whole = chosen.agent(0, PIECES["all"]).config
+    for piece, settings in PIECES.items():
+        changed = chosen.agent(0, settings).config
+        assert (changed == whole) == (piece == "all")
+
+
+@pytest.mark.slow
+def test_what_is_stored_is_not_run_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = Args(robots=("quadruped",), pieces=("all", "frozen"), jobs=1, out=tmp_path, cache=tmp_path)
+    main(args)
+    table = load(tmp_path / "ablations-quadruped.csv")
+    assert set(table["method"]) == {"all", "frozen"}
+    assert table["score"].between(-80, -1).all()
+    assert "less all" in capsys.readouterr().out
+    before = (tmp_path / "ablations-quadruped.csv").read_bytes()
+    main(args)
+    assert (tmp_path / "ablations-quadruped.csv").read_bytes() == before
