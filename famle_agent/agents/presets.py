@@ -97,6 +97,7 @@ def make_env(env: str | gym.Env[Any, Any] | VecEnv) -> gym.Env[Any, Any] | VecEn
     """Makes an environment from a robot's short name or a Gymnasium id; passes anything else through.
 
     Raises:
+        TypeError: It is no environment, such as the driver of a real robot.
         ValueError: The name is neither a known robot nor a registered id, or it is one of Gymnasium's vector
             environments.
     """
@@ -107,8 +108,14 @@ def make_env(env: str | gym.Env[Any, Any] | VecEnv) -> gym.Env[Any, Any] | VecEn
             "yourself, pass as episode_start whose episode ended in the last step (SAME_STEP, DISABLED), or in the one "
             "before it (NEXT_STEP, the default)."
         )
-    if not isinstance(env, str):
+    if isinstance(env, gym.Env | VecEnv):
         return env
+    if not isinstance(env, str):
+        raise TypeError(
+            f"Expected a robot's name, a Gymnasium id, a gymnasium.Env or a VecEnv of Stable-Baselines3, got a "
+            f"{type(env).__name__}. Meta-learn in a simulator of the robot. To drive the robot itself, load that agent "
+            "without an environment, FAMLE.load(path, reward_fn=...), plan with predict() and report with observe()."
+        )
     robots = {name: robot.env_id for name, robot in known_robots().items() if robot.env_id}
     try:
         return gym.make(robots.get(env, env))

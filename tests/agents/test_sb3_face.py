@@ -263,6 +263,15 @@ def test_an_id_that_nobody_knows_is_answered_with_the_package_in_front() -> None
         FAMLE("FamleElephant-v0")
 
 
+def test_driver_of_a_real_robot_is_answered_with_the_loop_for_it(fast: FAMLE) -> None:
+    class Driver:
+        def send(self, action: Any) -> None: ...
+
+    for give in (FAMLE, fast.set_env, lambda driver: FAMLEWrapper(driver, fast)):
+        with pytest.raises(TypeError, match=r"got a Driver.*FAMLE\.load.*predict.*observe"):
+            give(Driver())
+
+
 def test_what_is_known_of_many_robots_is_of_none_alone(fast: FAMLE) -> None:
     fast.set_env(DummyVecEnv([lambda: gym.make("FamleReacher-v0", max_episode_steps=5)] * 3))
     fast.learn(30)
