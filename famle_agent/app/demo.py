@@ -236,7 +236,7 @@ def _outcome(run: Rollout) -> str:
     parts = [f"{run.total:.1f} in {run.steps} steps{ending}"]
     if run.breaks_at:
         before, after = run.reward[: run.breaks_at].mean(), run.reward[run.breaks_at :].mean()
-        parts.append(f"a step {before:.2f} before the break, {after:.2f} after")
+        parts.append(f"{before:.2f} a step before the break, {after:.2f} after")
     return ", ".join(parts)
 
 

@@ -138,6 +138,11 @@ def test_captions_say_what_is_wrong_and_what_is_believed() -> None:
     ]
 
 
+def test_outcome_has_the_mean_reward_of_a_step_before_and_after_the_break() -> None:
+    run = Rollout(np.array([2.0, 1.0, 0.0]), np.zeros((4, 0)), *np.zeros((2, 3)), ["intact"] * 3, 1.0, breaks_at=1)
+    assert demo._outcome(run) == "3.0 in 3 steps, 2.00 a step before the break, 0.50 after"  # noqa: SLF001
+
+
 def test_films_have_their_titles_and_captions_above_and_below() -> None:
     films = {"one": [np.zeros((4, 4, 3), dtype=np.uint8)] * 2, "two": [np.zeros((4, 4, 3), dtype=np.uint8)]}
     plain = side_by_side(films, size=64)
