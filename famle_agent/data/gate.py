@@ -15,7 +15,6 @@ import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from famle_agent.data.watch import VecWatch
 
 __all__ = [
     "Step",
@@ -312,11 +311,9 @@ def vec_step(env: VecEnv, actions: Array) -> VecStep:
 
     Raises:
         ValueError: Something that they returned has a wrong type or shape.
-        Exception: What a robot has raised, with a note of its index where the robots are in this process.
     """
     n = env.num_envs
-    with VecWatch(env).noting_who_fails():
-        obs, rewards, dones, infos = env.step(np.array(actions))
+    obs, rewards, dones, infos = env.step(np.array(actions))
     for name, values, check in (("rewards", rewards, floats), ("dones", dones, numbers)):
         if (array := check(name, values)).shape != (n,):
             raise ValueError(f"The {name} of a VecEnv of {n} robots must have shape ({n},), got {array.shape}.")

@@ -81,12 +81,15 @@ class VecWatch:
     def step(self, actions: npt.NDArray[Any]) -> tuple[VecStep, npt.NDArray[np.bool_]]:
         """Steps the robots; arguments and errors as of :func:`~famle_agent.data.gate.vec_step`.
 
+        What a robot raises has a note of its index where the robots are in this process.
+
         Returns:
             What they returned, and which of them were reset otherwise than by the end of their episode, (n,); none
             where they are in other processes.
         """
         before = self._resets()
-        step = vec_step(self._env, actions)
+        with self._noting_who_fails():
+            step = vec_step(self._env, actions)
         resets = self._resets() - before
         return step, resets != step.dones if len(resets) else np.zeros_like(step.dones)
 
@@ -95,7 +98,7 @@ class VecWatch:
         return np.array([robot.resets for robot in self._robots], dtype=np.int64)
 
     @contextmanager
-    def noting_who_fails(self) -> Iterator[None]:
+    def _noting_who_fails(self) -> Iterator[None]:
         """Adds a note to an exception of a step: which robot was stepped last, and how the others would go on."""
         before = [robot.steps for robot in self._robots]
         try:
