@@ -246,7 +246,7 @@ def resolve_situation(
         if not presets:
             raise
         raise ValueError(
-            f"No situation is called {situation!r}{_suggest(situation, list(presets))} Presets: {', '.join(presets)}."
+            f"No situation is called {situation!r}{_suggest(situation, list(presets))} Presets: {'; '.join(presets)}."
         ) from error
 
 

@@ -174,7 +174,7 @@ def test_unsupported_fault_is_refused_by_name_and_changes_nothing(
 
 
 def test_unknown_preset_is_refused_with_the_list_of_presets(make: Make) -> None:
-    with pytest.raises(ValueError, match=r"'papper'; did you mean 'paper'\? Presets: intact, joint 0 dead, .*paper"):
+    with pytest.raises(ValueError, match=r"'papper'; did you mean 'paper'\? Presets: intact; joint 0 dead; .*paper"):
         make(situation="papper")
 
 

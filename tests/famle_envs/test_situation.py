@@ -366,7 +366,7 @@ def test_resolve_prefers_a_preset_to_a_description_of_the_same_text() -> None:
 
 
 def test_resolve_refuses_an_unknown_name_with_a_suggestion_and_all_presets() -> None:
-    with pytest.raises(ValueError, match=r"'papr'; did you mean 'paper'\? Presets: intact, paper, joint 0 dead"):
+    with pytest.raises(ValueError, match=r"'papr'; did you mean 'paper'\? Presets: intact; paper; joint 0 dead"):
         resolve_situation("papr", PRESETS)
 
 
