@@ -40,7 +40,7 @@ from famle_agent.adaptation.controller import OnlineState
 from famle_agent.agents.presets import known_robots
 from famle_agent.agents.world_model import WorldModel
 from famle_agent.data.collect import collect
-from famle_agent.data.policies import MakePolicy, make_held_uniform
+from famle_agent.data.policies import MakePolicy, Policy, make_held_uniform
 from famle_agent.models.dynamics import Batch
 from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.training.reptile import Reptile
@@ -187,25 +187,40 @@ def environment(robot: str, args: Args) -> dict[str, float]:
 
 
 def collection(robot: str, args: Args) -> dict[str, float]:
-    """Times the collection of transitions by chance and by planning, with one process and with two; wall time."""
+    """Times the collection of transitions by chance and by planning, all situations at once and one by one.
+
+    The time of the processor in one process; the wall time with one process and with two.
+    """
     agent = _agent(robot)
-    sources = agent.situation_envs().sources[:4]
+    sources = agent.situation_envs().sources[:_SITUATIONS]
     names = [f"situation {i}" for i in range(len(sources))]
+    plans, chance = agent.planning_policy(), make_held_uniform(agent.config.simulation.action_hold)
+    envs = [source() if callable(source) else source for source in sources]
     kinds: dict[str, tuple[MakePolicy, int]] = {
-        "by chance": (make_held_uniform(agent.config.simulation.action_hold), args.transitions),
-        "planned": (agent.planning_policy(), max(2, args.transitions // 50)),
+        "by chance": (chance, args.transitions),
+        "planned": (plans, max(2, args.transitions // 50)),
+        "planned one by one": (_alone(plans), max(2, args.transitions // 50)),
     }
-    ratios, speeds = dict[str, float](), dict[str, float]()
-    for kind, (policy, n) in kinds.items():
+    calls = [partial(collect, envs, names, n, policy, 0) for policy, n in kinds.values()]
+    times = medians(max(3, args.repeats // 4), *calls, warm_up=1)
+    speeds = {
+        f"{kind} (steps / s)": 1e3 * len(envs) * n / ms for (kind, (_, n)), ms in zip(kinds.items(), times, strict=True)
+    }
+    for env in envs:
+        env.close()
+    together, alone = speeds["planned (steps / s)"], speeds["planned one by one (steps / s)"]
+    figures = {"planned: together / one by one": together / alone}
+    for kind in ("by chance", "planned"):
+        policy, n = kinds[kind][0], kinds[kind][1] * 5
         for jobs in (1, 2):
             collect(sources, names, 2, policy, 0, n_jobs=jobs)  # starts the processes
             start = time.perf_counter()
             collect(sources, names, n, policy, 0, n_jobs=jobs)
-            seconds = time.perf_counter() - start
-            speeds[f"{kind}, {jobs} process(es) (steps / s)"] = len(sources) * n / seconds
+            wall = time.perf_counter() - start
+            speeds[f"{kind}, {jobs} process(es), wall time (steps / s)"] = len(sources) * n / wall
         one, two = list(speeds.values())[-2:]
-        ratios[f"{kind}: two processes / one"] = two / one
-    return ratios | speeds
+        figures[f"{kind}: two processes / one"] = two / one
+    return figures | speeds
 
 
 def control(robot: str, args: Args) -> dict[str, float]:
@@ -374,6 +389,15 @@ def _agent(robot: str, mode: str = "ours", situations: int = _SITUATIONS, **sett
     model = agent.policy.builder.dynamics(situations)
     agent.policy.world = WorldModel(model, tuple(f"situation {i}" for i in range(situations)))
     return agent
+
+
+def _alone(plans: MakePolicy) -> MakePolicy:
+    """Hides that a policy could act for several situations at once."""
+
+    def make(env: gym.Env[Any, Any], situation: int, rng: np.random.Generator) -> Policy:
+        return plans(env, situation, rng)
+
+    return make
 
 
 def _experienced(agent: FAMLE, robots: int) -> OnlineState:

@@ -182,7 +182,7 @@ class Controller:
         if self.guide is not None:
             likely = self.adapter.likely(state.belief)
             proposals = self.guide.proposals(model, obs, likely, self.planner.horizon, generator)
-            objective = self.guide.looking_beyond(objective, likely, model.members)
+            objective = self.guide.looking_beyond(objective, likely, model)
         action, plan = self.planner.plan(
             lambda tau: model.returns(objective, obs, tau), state.plan, generator, proposals, deadline
         )

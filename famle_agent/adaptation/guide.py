@@ -62,7 +62,7 @@ class Guide:
                 state = model(state, actions[-1]).mean(dim=1)  # of the ensemble
         return torch.stack(actions, dim=2)
 
-    def looking_beyond(self, objective: Objective, likely: Tensor, members: int) -> Objective:
+    def looking_beyond(self, objective: Objective, likely: Tensor, model: Simulator) -> Objective:
         """Adds the critics' value of where a plan ends: the mean of the most likely situation's and of none's.
 
         Where nothing like the robot was trained, the value of a situation is too high where its own policy does not go.
@@ -70,9 +70,9 @@ class Guide:
         Args:
             objective: What counts until then.
             likely: How likely each training situation is, (B, N).
-            members: P, rows of the model for each robot.
+            model: The adapted dynamics of B robots.
         """
-        likeliest = likely.argmax(dim=1).repeat_interleave(members)
+        likeliest = model.rows(likely.argmax(dim=1)[:, None])
         told = torch.stack([likeliest, torch.full_like(likeliest, -1)])[..., None]  # (2, B * P, 1)
 
         def value(obs: Tensor) -> Tensor:

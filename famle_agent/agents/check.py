@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -11,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from famle_agent.data import gate
-from famle_agent.data.envs import SituationEnvs
+from famle_agent.data.envs import SituationEnvs, opened
+from famle_agent.utils.errors import in_situation
 
 __all__ = ["Check", "check_plans"]
 
@@ -67,14 +69,14 @@ def check_plans(agent: Plans, envs: SituationEnvs, seed: int, steps: int = 200, 
         envs: The training situations.
         seed: Of the episodes and the random actions.
         steps: Steps of an episode at most.
-        situations: How many situations at most, evenly chosen.
+        situations: How many situations at most, evenly chosen; all of them are planned in one batch.
+
+    Raises:
+        Exception: What an environment raises, with a note that names the situation.
     """
     chosen = np.unique(np.linspace(0, len(envs.sources) - 1, min(situations, len(envs.sources))).round().astype(int))
-    sources = [envs.sources[i] for i in chosen]
-    made = [source if isinstance(source, gym.Env) else source() for source in sources]
-    space: Any = made[0].action_space
-    rng, shape, state = np.random.default_rng(seed), (len(made), *space.shape), None
-    errors = np.ones(len(made))
+    names, errors = tuple(envs.situations[i] for i in chosen), np.ones(len(chosen))
+    rng, state = np.random.default_rng(seed), None
 
     def plan(obs: Array) -> Array:
         nonlocal errors, state
@@ -82,33 +84,37 @@ def check_plans(agent: Plans, envs: SituationEnvs, seed: int, steps: int = 200, 
         errors = state.belief.errors.cpu().numpy()
         return np.asarray(action)
 
-    try:
+    with ExitStack() as stack:
+        made = [stack.enter_context(opened(envs.sources[i], envs.situations[i])) for i in chosen]
+        space: Any = made[0].action_space
+        shape = len(made), *space.shape
         actors: list[Callable[[Array], Array]] = [
             plan,
             lambda obs: np.broadcast_to(np.clip(0.0, space.low, space.high), shape),
             lambda obs: rng.uniform(space.low, space.high, shape),
         ]
-        (planned, nothing, random), lasted = zip(*(_returns(made, act, seed, steps) for act in actors), strict=True)
-    finally:
-        for env, source in zip(made, sources, strict=True):
-            if env is not source:
-                env.close()
-    return Check(tuple(envs.situations[i] for i in chosen), planned, nothing, random, errors, max(lasted))
+        returns = [_returns(made, names, act, seed, steps) for act in actors]
+    (planned, nothing, random), lasted = zip(*returns, strict=True)
+    return Check(names, planned, nothing, random, errors, max(lasted))
 
 
 def _returns(
-    envs: Sequence[gym.Env[Any, Any]], act: Callable[[Array], Array], seed: int, steps: int
+    envs: Sequence[gym.Env[Any, Any]], names: Sequence[str], act: Callable[[Array], Array], seed: int, steps: int
 ) -> tuple[Array, int]:
     """Returns what one episode in each environment yields, (n,), and the steps of the longest; the others wait."""
-    obs = np.stack([gate.reset(env, seed=seed)[0] for env in envs]).astype(np.float32)
     total, lives, lasted = np.zeros(len(envs)), np.ones(len(envs), dtype=bool), 0
+    obs = np.empty((len(envs), *(envs[0].observation_space.shape or ())), dtype=np.float32)
+    for i, env in enumerate(envs):
+        with in_situation(names[i]):
+            obs[i] = gate.reset(env, seed=seed)[0]
     while lasted < steps and lives.any():
         lasted += 1
         actions = act(obs).astype(envs[0].action_space.dtype)
         for i, env in enumerate(envs):
             if not lives[i]:
                 continue
-            step = gate.step(env, actions[i])
+            with in_situation(names[i]):
+                step = gate.step(env, actions[i])
             obs[i] = step.obs
             total[i] += step.reward
             lives[i] = not (step.terminated or step.truncated)

@@ -4,29 +4,35 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import numpy.typing as npt
 import torch
 from joblib import delayed
 
 from famle_agent.data import gate
-from famle_agent.data.policies import MakePolicy
+from famle_agent.data.envs import opened
+from famle_agent.data.policies import MakePolicy, MakeTogether, Together
 from famle_agent.data.transitions import EnvSource, Transitions
 from famle_agent.data.watch import Watch
+from famle_agent.utils.errors import in_situation
 from famle_agent.utils.parallel import as_completed
 
 __all__ = ["collect"]
+
+Array = npt.NDArray[Any]
 
 
 def collect(
     envs: Sequence[EnvSource],
     situations: Sequence[str],
     n: int,
-    make_policy: MakePolicy,
+    make_policy: MakePolicy | MakeTogether,
     seed: int,
     callback: Callable[[int], object] = lambda _: None,
     n_jobs: int = 1,
@@ -39,10 +45,11 @@ def collect(
         envs: One environment, or what makes it, per situation.
         situations: What each is called.
         n: Transitions per situation.
-        make_policy: Makes the policy of a situation.
+        make_policy: Makes the policy of a situation, or of several that are simulated side by side.
         seed: Seed of the environments and the policies. What is collected does not depend on ``n_jobs``.
         callback: Called with the number of new transitions after each situation.
-        n_jobs: Parallel processes, -1 for one a core; environments that exist already stay in this one.
+        n_jobs: Parallel processes, -1 for one a core; environments that exist already stay in this one, and so do
+            those that are simulated beside them.
         folder: Where each situation's transitions are stored as soon as they are there. What it holds of an earlier
             run that was stopped is not collected again.
         episode_length: Steps after which an episode is cut short; 0 leaves its end to the environment.
@@ -51,20 +58,24 @@ def collect(
         The transitions; the step that a reset interrupts is no transition and is not among them.
 
     Raises:
-        ValueError: The folder holds transitions of other situations, or of another number.
+        ValueError: The folder holds transitions of other situations, or of another number; or an environment returns
+            what is no transition.
+        Exception: What an environment raises, with a note that names the situation.
     """
+    maker = make_policy if isinstance(make_policy, MakeTogether) else _OneByOne(make_policy)
     sequences = np.random.SeedSequence(seed).spawn(len(envs))
-    tasks = [
-        _Task(i, env, situations[i], n, make_policy, sequence, folder, episode_length)
-        for i, (env, sequence) in enumerate(zip(envs, sequences, strict=True))
-    ]
+    robots = [_Robot(*robot) for robot in zip(range(len(envs)), envs, situations, sequences, strict=True)]
+    # Products of another size round otherwise, so that groups must not depend on the number of processes.
+    groups = np.array_split(np.arange(len(robots)), -(-len(robots) // maker.at_once))
+    tasks = [_Task([robots[i] for i in group], n, maker, folder, episode_length) for group in groups]
     parts: dict[int, Transitions] = {}
     for here in (True, False):
-        some = [task for task in tasks if isinstance(task.env, gym.Env) == here]
+        some = [task for task in tasks if task.stays_here == here]
         calls = (delayed(_in_process)(task, os.getpid()) for task in some)
-        for i, part in as_completed(calls, n_jobs=1 if here else n_jobs):
-            parts[i] = part
-            callback(n)
+        for of_group in as_completed(calls, n_jobs=1 if here else n_jobs):
+            parts |= of_group
+            for _ in of_group:
+                callback(n)
     arrays = {
         name: np.concatenate([getattr(parts[i], name) for i in range(len(envs))])
         for name in ("obs", "action", "reward", "next_obs")
@@ -74,65 +85,123 @@ def collect(
 
 
 @dataclass(frozen=True)
-class _Task:
-    """The transitions of one situation, to be collected or to be read where that was done before."""
+class _OneByOne:
+    """Has a policy of one situation act for a group of one."""
+
+    make_policy: MakePolicy
+    at_once: int = 1
+
+    def together(
+        self, envs: Sequence[gym.Env[Any, Any]], situations: Sequence[int], rng: np.random.Generator
+    ) -> Together:
+        policy = self.make_policy(envs[0], situations[0], rng)
+        return lambda obs, episode_start: np.asarray(policy(obs[0], bool(episode_start[0])))[None]
+
+
+@dataclass(frozen=True)
+class _Robot:
+    """A robot in one situation."""
 
     index: int
-    env: EnvSource
+    source: EnvSource
     situation: str
-    n: int
-    make_policy: MakePolicy
     sequence: np.random.SeedSequence
+
+
+@dataclass(frozen=True)
+class _Task:
+    """The transitions of a group of robots, to be collected side by side or to be read where that was done before."""
+
+    robots: Sequence[_Robot]
+    n: int
+    maker: MakeTogether
     folder: Path | None
     episode_length: int
 
-    def run(self) -> tuple[int, Transitions]:
-        path = None if self.folder is None else self.folder / f"situation-{self.index:03d}.npz"
-        if path is not None and path.exists():
-            stored = Transitions.load(path)
-            if stored.situations != (self.situation,) or stored.obs.shape[:2] != (1, self.n):
-                raise ValueError(
-                    f"{path} holds {stored.obs.shape[1]} transitions of {stored.situations[0]!r} instead of {self.n} "
-                    f"of {self.situation!r}: it is of another run. Give another folder, or delete this one."
-                )
-            return self.index, stored
-        env = self.env if isinstance(self.env, gym.Env) else self.env()
-        try:
-            part = _run_policy(env, self)
-        finally:
-            if env is not self.env:
-                env.close()
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            part.save(path)
-        return self.index, part
+    @property
+    def stays_here(self) -> bool:
+        """Whether an environment is there already, which cannot be sent to another process."""
+        return any(isinstance(robot.source, gym.Env) for robot in self.robots)
+
+    def run(self) -> dict[int, Transitions]:
+        parts = {robot.index: part for robot in self.robots if (part := self._stored(robot)) is not None}
+        if len(parts) == len(self.robots):
+            return parts
+        # Where some are missing, all are simulated once more: what is planned for one depends on who is beside it.
+        for robot, part in zip(self.robots, self._collected(), strict=True):
+            if robot.index in parts:
+                continue
+            parts[robot.index] = part
+            if self.folder is not None:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                part.save(self._path(robot, self.folder))
+        return parts
+
+    @staticmethod
+    def _path(robot: _Robot, folder: Path) -> Path:
+        return folder / f"situation-{robot.index:03d}.npz"
+
+    def _stored(self, robot: _Robot) -> Transitions | None:
+        if self.folder is None or not (path := self._path(robot, self.folder)).exists():
+            return None
+        stored = Transitions.load(path)
+        if stored.situations != (robot.situation,) or stored.obs.shape[:2] != (1, self.n):
+            raise ValueError(
+                f"{path} holds {stored.obs.shape[1]} transitions of {stored.situations[0]!r} instead of {self.n} "
+                f"of {robot.situation!r}: it is of another run. Give another folder, or delete this one."
+            )
+        return stored
+
+    def _collected(self) -> list[Transitions]:
+        with ExitStack() as stack:
+            envs = [stack.enter_context(opened(robot.source, robot.situation)) for robot in self.robots]
+            rng = np.random.default_rng(self.robots[0].sequence)
+            policy = self.maker.together(envs, [robot.index for robot in self.robots], rng)
+            lives = [_Life(env, robot, self.episode_length) for env, robot in zip(envs, self.robots, strict=True)]
+            for _ in range(self.n):
+                actions = policy(np.stack([life.obs for life in lives]), np.array([life.begins for life in lives]))
+                for life, action in zip(lives, actions, strict=True):
+                    life.step(action)
+            return [life.transitions() for life in lives]
 
 
-def _in_process(task: _Task, parent: int) -> tuple[int, Transitions]:
+class _Life:
+    """What a robot goes through, episode after episode.
+
+    Attributes:
+        obs: Where it is, (obs_dim,).
+        begins: Whether an episode begins there.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], robot: _Robot, episode_length: int) -> None:
+        self._env, self._robot, self._episode_length = env, robot, episode_length
+        self._watch, self._age, self.begins = Watch(env), 0, True
+        self._rows: list[tuple[Array, Array, float, Array]] = []
+        self._ended: list[bool] = []
+        with in_situation(robot.situation):
+            self.obs, _ = gate.reset(env, seed=int(robot.sequence.generate_state(1)[0]))
+
+    def step(self, action: Array) -> None:
+        """Takes an action, (action_dim,), and begins another episode where that ends one."""
+        with in_situation(self._robot.situation):
+            resets = self._watch.resets
+            step = gate.step(self._env, action)
+            gate.check_not_reset(self._env, self._watch.resets - resets)
+            self._rows.append((self.obs, action, step.reward, step.obs))
+            self._ended.append(step.terminated)
+            self._age += 1
+            self.obs, self.begins = step.obs, step.terminated or step.truncated or self._age == self._episode_length
+            if self.begins:
+                (self.obs, _), self._age = gate.reset(self._env), 0
+
+    def transitions(self) -> Transitions:
+        """Returns all so far, (1, n, ...)."""
+        obs, action, reward, next_obs = (np.array(column)[None] for column in zip(*self._rows, strict=True))
+        terminated = np.array([self._ended]) if any(self._ended) else None
+        return Transitions(obs, action, reward, next_obs, (self._robot.situation,), terminated)
+
+
+def _in_process(task: _Task, parent: int) -> dict[int, Transitions]:
     if os.getpid() != parent:  # joblib may run it in a thread, or right here
         torch.set_num_threads(1)  # the parallel processes share the cores
     return task.run()
-
-
-def _run_policy(env: gym.Env[Any, Any], task: _Task) -> Transitions:
-    policy = task.make_policy(env, task.index, np.random.default_rng(task.sequence))
-    rows: list[tuple[Any, Any, Any, Any]] = []
-    ended: list[bool] = []
-    watch = Watch(env)
-    obs, _ = gate.reset(env, seed=int(task.sequence.generate_state(1)[0]))
-    episode_start, age = True, 0
-    while len(rows) < task.n:
-        action = policy(obs, episode_start)
-        resets = watch.resets
-        step = gate.step(env, action)
-        gate.check_not_reset(env, watch.resets - resets)
-        rows.append((obs, action, step.reward, step.obs))
-        ended.append(step.terminated)
-        age += 1
-        obs, episode_start = step.obs, step.terminated or step.truncated or age == task.episode_length
-        if episode_start:
-            (obs, _), age = gate.reset(env), 0
-    columns = [np.array(column)[None] for column in zip(*rows, strict=True)]
-    obs_, action_, reward_, next_obs_ = columns
-    terminated_ = np.array([ended]) if any(ended) else None
-    return Transitions(obs_, action_, reward_, next_obs_, (task.situation,), terminated_)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, count
@@ -15,11 +16,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from famle_agent.data.description import FAULTS, ONLOOKERS, env_attribute, plain_spec
 from famle_agent.data.transitions import EnvSource, check_names
+from famle_agent.utils.errors import in_situation
 from famle_envs.faults import make_faulty
 from famle_envs.profile import Profile
 from famle_envs.situation import Situation
 
-__all__ = ["EnvLike", "SituationEnvs", "SituationsLike", "situation_envs"]
+__all__ = ["EnvLike", "SituationEnvs", "SituationsLike", "opened", "situation_envs"]
 
 EnvLike = gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]] | Situation | Mapping[str, Any] | str
 """An environment, a factory of one, or the situation of one."""
@@ -85,6 +87,18 @@ def situation_envs(env: VecEnv, envs: SituationsLike | None, episode_length: int
         labels.append(names[i] if names else next(name for name in own_names if name not in labels))
         check_names(labels)
     return SituationEnvs(sources, labels)
+
+
+@contextmanager
+def opened(source: EnvSource, situation: str) -> Iterator[gym.Env[Any, Any]]:
+    """Makes an environment and closes it in the end; one that is there already stays open."""
+    with in_situation(situation):
+        env = source if isinstance(source, gym.Env) else source()
+    try:
+        yield env
+    finally:
+        if env is not source:
+            env.close()
 
 
 def _check_different(items: Sequence[EnvLike]) -> None:

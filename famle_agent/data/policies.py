@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
@@ -23,7 +23,9 @@ __all__ = [
     "REWARDS",
     "HeldUniformPolicy",
     "MakePolicy",
+    "MakeTogether",
     "PlanningPolicy",
+    "Together",
     "make_held_uniform",
     "make_planning",
     "reward_names",
@@ -31,12 +33,22 @@ __all__ = [
 
 Array = npt.NDArray[Any]
 
+_ROWS_AT_ONCE = 640
+"""Candidates times networks of a plan, after which a processor's cache is full, and more at once are no faster."""
+
 
 class Policy(Protocol):
     """Chooses actions."""
 
     def __call__(self, obs: Array, episode_start: bool) -> Array:
         """The action for an observation, in the environment's action space."""
+
+
+class Together(Protocol):
+    """Chooses the actions of B robots at once."""
+
+    def __call__(self, obs: Array, episode_start: Array) -> Array:
+        """The actions for observations (B, obs_dim), (B, action_dim), in the environments' action space."""
 
 
 REWARDS = ("planning_reward_fn", "reward_fn")
@@ -70,6 +82,20 @@ MakePolicy = Callable[[gym.Env[Any, Any], int, np.random.Generator], Policy]
 """A policy for an environment and the index of its situation; picklable where data are collected in processes."""
 
 
+@runtime_checkable
+class MakeTogether(Protocol):
+    """Makes a policy for several situations, which are simulated side by side."""
+
+    @property
+    def at_once(self) -> int:
+        """How many situations at most."""
+
+    def together(
+        self, envs: Sequence[gym.Env[Any, Any]], situations: Sequence[int], rng: np.random.Generator
+    ) -> Together:
+        """Makes the policy of some environments, given the index of each one's situation."""
+
+
 class HeldUniformPolicy:
     """Uniformly random actions, each held for some steps.
 
@@ -91,7 +117,7 @@ class HeldUniformPolicy:
 
 
 class PlanningPolicy:
-    """The agent's own planning, with a model that does not change."""
+    """The agent's own planning for B robots, with a model that does not change."""
 
     def __init__(
         self,
@@ -106,18 +132,30 @@ class PlanningPolicy:
         self._plan: Tensor | None = None
 
     @torch.no_grad()
-    def __call__(self, obs: Array, episode_start: bool) -> Array:
-        """Plans from where the last plan left off."""
-        if self._plan is None or episode_start:
-            self._plan = torch.zeros(1, self._planner.horizon, *self._space.shape, dtype=torch.float32)
-        state = torch.as_tensor(obs, dtype=torch.float32)[None]
+    def __call__(self, obs: Array, episode_start: Array) -> Array:
+        """Plans from where the last plans left off, and anew where an episode begins; see :class:`Together`."""
+        state = torch.as_tensor(obs, dtype=torch.float32)  # (B, obs_dim)
+        if self._plan is None:
+            self._plan = state.new_zeros(len(state), self._planner.horizon, *self._space.shape)
+        start = torch.where(torch.as_tensor(episode_start)[:, None, None], 0.0, self._plan)
 
         def judge(tau: Tensor) -> Tensor:
             return self._model.returns(self._objective, state, tau)
 
-        action, plan = self._planner.plan(judge, self._plan, self._generator)
+        action, plan = self._planner.plan(judge, start, self._generator)
         self._plan = shift(plan)
-        return to_action_space(action[0], self._space)
+        return to_action_space(action, self._space)
+
+
+@dataclass(frozen=True)
+class _Alone:
+    """A policy of one robot."""
+
+    policy: Together
+
+    def __call__(self, obs: Array, episode_start: bool) -> Array:
+        action: Array = self.policy(obs[None], np.array([episode_start]))[0]
+        return action
 
 
 @dataclass(frozen=True)
@@ -153,19 +191,43 @@ class make_planning:  # noqa: N801
     rewards: tuple[str, ...] = REWARDS
     termination_fn: TerminationFn | None = None
 
-    @torch.no_grad()
+    @property
+    def at_once(self) -> int:
+        """As many situations as keep a processor busy; no more, so that others are left for other processes."""
+        return max(1, _ROWS_AT_ONCE // (self.model.members * self.planner.candidates))
+
     def __call__(self, env: gym.Env[Any, Any], situation: int, rng: np.random.Generator) -> Policy:
         """See :data:`MakePolicy`."""
-        scale = ActionScale.of(env.action_space, torch.device("cpu"))  # type: ignore[arg-type]
-        in_env_units: RewardFn = self.reward_fn or _reward_of(env, self.rewards)
+        return _Alone(self.together([env], [situation], rng))
+
+    @torch.no_grad()
+    def together(
+        self, envs: Sequence[gym.Env[Any, Any]], situations: Sequence[int], rng: np.random.Generator
+    ) -> PlanningPolicy:
+        """See :class:`MakeTogether`."""
+        space: Any = envs[0].action_space
+        scale = ActionScale.of(space, torch.device("cpu"))
+        model = Simulator(self.model, self.model.embeddings_of(torch.tensor(situations)))
+        in_env_units = self.reward_fn or _joint_reward([_reward_of(env, self.rewards) for env in envs], model)
 
         def reward_fn(obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
             return in_env_units(obs, scale.from_unit(action), next_obs)
 
-        return PlanningPolicy(
-            Simulator(self.model, self.model.embeddings_of(torch.tensor([situation]))),
-            Objective(reward_fn, self.termination_fn),
-            self.planner,
-            env.action_space,  # type: ignore[arg-type]
-            torch.Generator().manual_seed(int(rng.integers(2**63))),
-        )
+        generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
+        return PlanningPolicy(model, Objective(reward_fn, self.termination_fn), self.planner, space, generator)
+
+
+def _joint_reward(rewards: Sequence[RewardFn], model: Simulator) -> RewardFn:
+    """Asks each robot's own reward function, which may know of a goal that others do not have."""
+    if all(reward == rewards[0] for reward in rewards):
+        return rewards[0]
+
+    def reward_fn(obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
+        of_robots = (model.of_robots(values).unbind() for values in (obs, action, next_obs))  # B times (P, n, dim)
+        own = [
+            torch.as_tensor(reward(*transition), dtype=obs.dtype).expand(transition[0].shape[:2])
+            for reward, *transition in zip(rewards, *of_robots, strict=True)
+        ]
+        return model.rows(torch.stack(own))
+
+    return reward_fn

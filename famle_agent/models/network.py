@@ -17,7 +17,10 @@ Theta = dict[str, Tensor]
 """Parameters by name; those of several networks are stacked along the leading axes."""
 
 Layers = list[tuple[Tensor, Tensor]]
-"""Weights (K, in, out) and biases (K, 1, out) of K networks whose situation is fixed."""
+"""Weights (K, in, out) and biases (K, 1, out) of K networks whose situation is fixed.
+
+Layers behind the first may have fewer, which several situations share.
+"""
 
 
 @dataclass(frozen=True)
@@ -110,26 +113,42 @@ class Network:
         return self.through(self._layers_behind_the_first(theta), self._activate(z))
 
     def folded(self, theta: Theta, h: Tensor) -> Layers:
-        """Fixes the situation: what h (K, embedding_dim) does to the first layer becomes part of its weights.
+        """Fixes the situations: what h does to the first layer becomes part of its weights.
 
         The result of :meth:`through` is then that of :meth:`__call__`, at the cost of a network without embeddings.
+
+        Args:
+            theta: Parameters, (K, ...).
+            h: Embeddings, (K * S, embedding_dim): S situations of each network, one after the other.
+
+        Returns:
+            A first layer of K * S networks, and the other layers of K.
         """
-        weight = theta["weight_0"]  # (K, in, out)
+        S = len(h) // len(theta["weight_0"])
+
+        def first(name: str) -> Tensor:  # (K * S, ...)
+            return theta[name][:, None].expand(-1, S, *theta[name].shape[1:]).flatten(0, 1)
+
+        weight = first("weight_0")  # (K * S, in, out)
         if self.interaction_rank:
-            scale = torch.einsum("ke,ker->kr", h, theta["interaction_situation"])
-            weight = torch.baddbmm(weight, theta["interaction_input"] * scale[:, None], theta["interaction_output"])
+            scale = torch.einsum("ke,ker->kr", h, first("interaction_situation"))
+            weight = torch.baddbmm(weight, first("interaction_input") * scale[:, None], first("interaction_output"))
         if self.gate_actions:
-            gate = 1.0 + torch.einsum("ke,kea->ka", h, theta["gate"])
+            gate = 1.0 + torch.einsum("ke,kea->ka", h, first("gate"))
             weight = torch.cat([weight[:, : self.n_features], gate[..., None] * weight[:, self.n_features :]], dim=1)
-        bias = theta["bias_0"] + torch.einsum("ke,keo->ko", h, theta["embedding"])
+        bias = first("bias_0") + torch.einsum("ke,keo->ko", h, first("embedding"))
         return [(weight, bias[:, None]), *self._layers_behind_the_first(theta)]
 
     def through(self, layers: Layers, x: Tensor) -> Tensor:
-        """Computes the last layers, (K, n, in) -> (K, n, outputs)."""
+        """Computes the last layers, (K, n, in) -> (K, n, outputs).
+
+        Where a layer has fewer than K networks, as many rows of K that follow each other share one.
+        """
+        K, n = x.shape[:2]
         for weight, bias in layers[:-1]:
-            x = self._activate(torch.baddbmm(bias, x, weight))
+            x = self._activate(torch.baddbmm(bias, _sharing(x, weight), weight))
         weight, bias = layers[-1]
-        z = torch.baddbmm(bias, x, weight)
+        z = torch.baddbmm(bias, _sharing(x, weight), weight).view(K, n, self.outputs)
         return self.output_limit * z.tanh() if self.output_limit else z
 
     def _layers_behind_the_first(self, theta: Theta) -> Layers:
@@ -139,3 +158,8 @@ class Network:
     def _activate(self, z: Tensor) -> Tensor:
         inplace = not torch.is_grad_enabled()
         return F.silu(z, inplace=inplace) if self.activation == "silu" else F.relu(z, inplace=inplace)
+
+
+def _sharing(x: Tensor, weight: Tensor) -> Tensor:
+    """Puts the rows that share weights together, (K, n, in) -> (k, K / k * n, in) for weights (k, in, out)."""
+    return x if len(x) == len(weight) else x.reshape(len(weight), -1, x.shape[-1])

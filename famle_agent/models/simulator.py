@@ -25,7 +25,8 @@ _FEWEST_AT_ONCE = 64
 class Simulator:
     """Predicts as :meth:`Dynamics.predict` does, for B robots whose theta and h do not change.
 
-    What h does to the first layer, the normalisation and the choice of features become part of the weights.
+    What h does to the first layer, the normalisation and the choice of features become part of the weights. Robots with
+    theta_meta share all other layers: they are no copies, and one product is of all robots.
 
     Args:
         model: Says what the parameters mean.
@@ -47,12 +48,13 @@ class Simulator:
                 f"members, as embeddings_of(situations) gives them; got {tuple(h.shape)}."
             )
         self._model, (self._robots, self._members) = model, h.shape[:2]
-        theta = model.theta_of(self._robots) if theta is None else theta
-        networks = {name: value.flatten(0, 1) for name, value in theta.items()}  # (B * P, ...)
-        self._layers = _in_units_of_the_environment(model, model.network.folded(networks, h.flatten(0, 1)))
+        self._shares = theta is None and model.robots == 1
+        theta = model.theta_of(1 if self._shares else self._robots) if theta is None else theta
+        networks = {name: value.flatten(0, 1) for name, value in theta.items()}  # (P, ...), or (B * P, ...)
+        self._layers = _in_units_of_the_environment(model, model.network.folded(networks, self.rows(h)))
         self._within: tuple[Tensor, Tensor] | None = None
         if within is not None:
-            low, high = (bound.repeat_interleave(self._members, dim=0)[:, None] for bound in within)
+            low, high = (self.rows(bound[:, None])[:, None] for bound in within)
             self._within = low, high
 
     @property
@@ -72,13 +74,25 @@ class Simulator:
             obs: Observations, (B, n, obs_dim), or (B, P, n, obs_dim) where the members disagree already.
             action: Actions in [-1, 1], (B, n, action_dim) or (B, P, n, action_dim).
         """
-        B, P = self._robots, self._members
+        rows = (self.rows(values if values.ndim == 4 else values[:, None]) for values in (obs, action))
+        return self.of_robots(self._step(*rows))
 
-        def rows(values: Tensor) -> Tensor:
-            values = values if values.ndim == 4 else values[:, None]
-            return values.expand(B, P, -1, -1).flatten(0, 1)
+    def rows(self, values: Tensor) -> Tensor:
+        """Turns values of each member of each robot, (B, P, ...) or (B, 1, ...), into rows as an objective sees them.
 
-        return self._step(rows(obs), rows(action)).view(B, P, *obs.shape[-2:])
+        The networks of robots that share theirs follow each other.
+
+        Returns:
+            A row for each member of each robot, (B * P, ...).
+        """
+        values = values.expand(-1, self._members, *values.shape[2:])
+        return (values.transpose(0, 1) if self._shares else values).flatten(0, 1)
+
+    def of_robots(self, rows: Tensor) -> Tensor:
+        """Turns such rows into values of each member of each robot, (B * P, ...) -> (B, P, ...)."""
+        if self._shares:
+            return rows.view(self._members, self._robots, *rows.shape[1:]).transpose(0, 1)
+        return rows.view(self._robots, self._members, *rows.shape[1:])
 
     def returns(self, objective: Objective, obs: Tensor, actions: Tensor) -> Tensor:
         """Computes what candidate sequences of actions yield, (B, N), a mean over the members of the ensemble.
@@ -86,13 +100,12 @@ class Simulator:
         A planner finds what a single model is wrong about; that several are wrong in the same way is rarer.
 
         Args:
-            objective: What counts.
+            objective: What counts; it is given :meth:`rows`.
             obs: Where the robots are, (B, obs_dim).
             actions: Candidates in [-1, 1], (B, N, H, action_dim).
         """
-        obs, actions = (values.repeat_interleave(self._members, dim=0) for values in (obs, actions))
-        of_members = imagine(self._step, objective, obs, actions)  # (B * P, N)
-        return of_members.view(self._robots, self._members, -1).mean(dim=1)
+        of_members = imagine(self._step, objective, self.rows(obs[:, None]), self.rows(actions[:, None]))  # (B * P, N)
+        return self.of_robots(of_members).mean(dim=1)
 
     def _step(self, obs: Tensor, action: Tensor) -> Tensor:
         """Predicts the next observations from a row for each member of each robot, (B * P, n, ...)."""

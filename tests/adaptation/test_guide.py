@@ -40,7 +40,7 @@ def test_value_of_the_most_likely_situation_and_of_none_lies_beyond_a_plan() -> 
     guide, model, obs = made()
     guide.actor_critic.discount.fill_(0.5)
     likely = torch.tensor([[0.1, 0.2, 0.7], [0.6, 0.1, 0.3]])
-    objective = guide.looking_beyond(Objective(lambda s, a, s_next: s_next[..., 0]), likely, model.members)
+    objective = guide.looking_beyond(Objective(lambda s, a, s_next: s_next[..., 0]), likely, model)
     actions, untold = torch.randn(2, 3, 1, 1).clamp(-1.0, 1.0), torch.tensor(-1)
     found = model.returns(objective, obs, actions)
     after = model(obs[:, None].expand(-1, 3, -1), actions[:, :, 0])  # (2, P, 3, obs_dim)

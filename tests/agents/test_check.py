@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -33,6 +34,17 @@ def test_errors_are_those_of_the_robots_in_the_end(filtering: FAMLE) -> None:
     np.testing.assert_array_equal(
         check_plans(filtering, filtering.situation_envs(SITUATIONS), seed=0).errors, found.errors
     )
+
+
+def test_environment_that_fails_names_its_situation(filtering: FAMLE) -> None:
+    def failing() -> gym.Env[Any, Any]:
+        env = gym.make("FamleReacher-v0")
+        env.unwrapped.step = lambda action: 1 / 0  # type: ignore[assignment]
+        return env
+
+    envs = filtering.situation_envs({"good": lambda: gym.make("FamleReacher-v0"), "bad": failing})
+    with pytest.raises(ZeroDivisionError, match="in the situation 'bad'"):
+        check_plans(filtering, envs, seed=0)
 
 
 def test_diagnosis_measures_errors_in_usual_ones(filtering: FAMLE) -> None:

@@ -170,6 +170,57 @@ def test_planned_action_lies_in_the_action_space(low: float, high: float) -> Non
     model = plane_model()
     simulator = Simulator(model, model.embeddings_of(torch.tensor([0])))
     policy = PlanningPolicy(simulator, lambda obs, action, next_obs: obs[..., 0], planner, space, chance)
-    action = policy(np.zeros(2, dtype=np.float32), True)
+    (action,) = policy(np.zeros((1, 2), dtype=np.float32), np.array([True]))
     assert space.contains(action)
     np.testing.assert_allclose(action, [high, low], rtol=1e-6)
+
+
+# --- several robots at once -----------------------------------------------------------------------------------
+
+
+@every_planner
+def test_robots_plan_together_each_for_its_situation_and_its_own_goal(planner: Any) -> None:
+    goals = [(3.0, -3.0), (3.0, -3.0), (-3.0, 3.0), (-3.0, -3.0)]
+    make = make_planning(plane_model(members=2), planner, None)
+    policy = make.together([Plane(goal) for goal in goals], [0, 1, 0, 1], np.random.default_rng(0))
+    actions = policy(np.zeros((4, 2), np.float32), np.ones(4, dtype=bool))
+    assert actions.dtype == np.float32
+    signs = np.array([[1.0, -1.0], [-1.0, 1.0], [-1.0, 1.0], [1.0, 1.0]])
+    assert (signs * np.array([unit(action) for action in actions]) > 0.5).all()
+
+
+def test_episode_that_begins_voids_the_plan_of_its_own_robot_alone() -> None:
+    class Recorder(ICEM):
+        def plan(self, judge: Any, start: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+            starts.append(start.clone())
+            return super().plan(judge, start, generator)
+
+    starts: list[Tensor] = []
+    make = make_planning(plane_model(), Recorder(4, candidates=20, iterations=2), None)
+    policy = make.together([Plane((3.0, 3.0)), Plane((-3.0, 3.0))], [0, 0], np.random.default_rng(0))
+    for begins in ([True, True], [False, True]):
+        policy(np.zeros((2, 2), np.float32), np.array(begins))
+    assert starts[0].abs().max() == 0
+    assert starts[1][0].abs().max() > 0.1
+    assert starts[1][1].abs().max() == 0
+
+
+def test_rewards_of_robots_may_be_numbers_and_numpy_arrays() -> None:
+    class Odd(Plane):
+        def reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
+            return 1.0
+
+    class Numpy(Plane):
+        def reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
+            return super().reward_fn(obs, action, next_obs).numpy()
+
+    make = make_planning(plane_model(), PLANNERS[0], None)
+    policy = make.together([Odd(), Numpy((3.0, -3.0))], [0, 0], np.random.default_rng(0))
+    action = unit(policy(np.zeros((2, 2), np.float32), np.ones(2, dtype=bool))[1])
+    assert action[0] > 0.5
+    assert action[1] < -0.5
+
+
+@pytest.mark.parametrize(("candidates", "members", "at_once"), [(32, 4, 5), (10_000, 1, 1), (8, 2, 40)])
+def test_plans_that_are_large_are_made_one_by_one(candidates: int, members: int, at_once: int) -> None:
+    assert make_planning(plane_model(members), ICEM(4, candidates=candidates), None).at_once == at_once

@@ -94,3 +94,15 @@ def test_initial_weights_may_be_those_of_pytorch_s_own_layers() -> None:
         assert 0 < model.theta[name.replace("weight", "bias")].abs().max() <= layer.in_features**-0.5
     assert model.theta["embedding"].abs().max() <= 33**-0.5
     assert model.embeddings.std().item() == pytest.approx(1.0, rel=0.1)
+
+
+def test_situations_share_all_layers_but_the_first() -> None:
+    model = simple_model(interaction_rank=3, hidden=(6, 5))
+    theta, _ = parameters(model)
+    h, x = torch.randn(2 * 4, model.embeddings.shape[-1]), torch.randn(2 * 4, 7, model.n_features + model.action_dim)
+    layers = model.network.folded(theta, h)
+    assert [len(weight) for weight, _ in layers] == [8, 2, 2]
+    copies = {name: value.repeat_interleave(4, dim=0) for name, value in theta.items()}
+    torch.testing.assert_close(
+        model.network.through(layers, x), model.network(copies, x, h[:, None]), rtol=1e-4, atol=1e-4
+    )

@@ -103,6 +103,23 @@ def test_return_is_the_mean_over_members_of_the_sum_of_rewards(
     torch.testing.assert_close(found, expected.mean(dim=1), rtol=1e-6, atol=1e-6)
 
 
+@given(models(), st.integers(1, 4))
+def test_robots_that_share_networks_are_judged_as_with_copies_of_them(model: Dynamics, robots: int) -> None:
+    """Each in its own situation, with a reward of its own."""
+    model, h = model.double(), random_h(model, robots).double()
+    obs = torch.randn(robots, model.obs_dim, dtype=torch.float64)
+    actions = torch.rand(robots, 3, 2, model.action_dim, dtype=torch.float64) * 2 - 1
+    wanted = torch.randn(robots, 1, 1, dtype=torch.float64)
+    returns = []
+    for theta in (None, model.theta_of(robots)):
+        simulator = Simulator(model, h, theta)
+        assert torch.equal(simulator.of_robots(simulator.rows(h)), h)
+        own = simulator.rows(wanted)  # (B * P, 1)
+        objective = Objective(lambda obs, action, next_obs, own=own: own * next_obs.sum(dim=-1))  # type: ignore[misc]
+        returns.append(simulator.returns(objective, obs, actions))
+    torch.testing.assert_close(*returns, rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_one_member_that_diverges_is_enough(bad: float) -> None:
     """The worst return for the robot that it is of, and for no other."""

@@ -255,25 +255,23 @@ def test_interrupted_run_goes_on_to_the_same_agent(
 def test_interrupted_simulation_goes_on_to_the_same_agent(
     make_agent: Make, uninterrupted: Dynamics, tmp_path: Path
 ) -> None:
-    """Stopped in the first round of planning, in its second situation."""
-    agent, planning = make_agent(), meta_training.planning_policy
+    """Stopped in the first round of planning, when one of its situations was stored."""
+    save = Transitions.save
 
-    def stops(policy: Any) -> Any:
-        make = planning(policy)
-
-        def make_policy(env: Any, situation: int, rng: np.random.Generator) -> Any:
-            if situation == 1:
-                raise KeyboardInterrupt
-            return make(env, situation, rng)
-
-        return make_policy
+    def stops(transitions: Transitions, path: Path) -> None:
+        if path.parent.name == "round-1" and path.name != "situation-000.npz":
+            raise KeyboardInterrupt
+        save(transitions, path)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(meta_training, "planning_policy", stops)
+        patch.setattr(Transitions, "save", stops)
         with pytest.raises(KeyboardInterrupt):
-            agent.meta_learn(SITUATIONS, folder=tmp_path)
-    assert [file.name for file in (tmp_path / "round-1").iterdir()] == ["situation-000.npz"]
+            make_agent().meta_learn(SITUATIONS, folder=tmp_path)
+    (first,) = (tmp_path / "round-1").iterdir()
+    stored_then = first.read_bytes()
     assert_same(make_agent().meta_learn(SITUATIONS, folder=tmp_path).dynamics, uninterrupted)
+    assert first.name == "situation-000.npz"
+    assert first.read_bytes() == stored_then
 
 
 def test_run_that_is_done_is_only_read(make_agent: Make, uninterrupted: Dynamics, tmp_path: Path) -> None:
