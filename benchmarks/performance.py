@@ -199,7 +199,7 @@ def collection(robot: str, args: Args) -> dict[str, float]:
     kinds: dict[str, tuple[MakePolicy, int]] = {
         "by chance": (chance, args.transitions),
         "planned": (plans, max(2, args.transitions // 50)),
-        "planned one by one": (_alone(plans), max(2, args.transitions // 50)),
+        "planned one by one": (_one_by_one(plans), max(2, args.transitions // 50)),
     }
     calls = [partial(collect, envs, names, n, policy, 0) for policy, n in kinds.values()]
     times = medians(max(3, args.repeats // 4), *calls, warm_up=1)
@@ -391,7 +391,7 @@ def _agent(robot: str, mode: str = "ours", situations: int = _SITUATIONS, **sett
     return agent
 
 
-def _alone(plans: MakePolicy) -> MakePolicy:
+def _one_by_one(plans: MakePolicy) -> MakePolicy:
     """Hides that a policy could act for several situations at once."""
 
     def make(env: gym.Env[Any, Any], situation: int, rng: np.random.Generator) -> Policy:

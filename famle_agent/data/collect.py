@@ -17,7 +17,7 @@ from joblib import delayed
 
 from famle_agent.data import gate
 from famle_agent.data.envs import opened
-from famle_agent.data.policies import MakePolicy, MakeTogether, Together
+from famle_agent.data.policies import BatchPolicy, MakeBatchPolicy, MakePolicy
 from famle_agent.data.transitions import EnvSource, Transitions
 from famle_agent.data.watch import Watch
 from famle_agent.utils.errors import in_situation
@@ -32,7 +32,7 @@ def collect(
     envs: Sequence[EnvSource],
     situations: Sequence[str],
     n: int,
-    make_policy: MakePolicy | MakeTogether,
+    make_policy: MakePolicy | MakeBatchPolicy,
     seed: int,
     callback: Callable[[int], object] = lambda _: None,
     n_jobs: int = 1,
@@ -62,19 +62,19 @@ def collect(
             what is no transition.
         Exception: What an environment raises, with a note that names the situation.
     """
-    maker = make_policy if isinstance(make_policy, MakeTogether) else _OneByOne(make_policy)
+    maker = make_policy if isinstance(make_policy, MakeBatchPolicy) else _OneByOne(make_policy)
     sequences = np.random.SeedSequence(seed).spawn(len(envs))
     robots = [_Robot(*robot) for robot in zip(range(len(envs)), envs, situations, sequences, strict=True)]
-    # Products of another size round otherwise, so that groups must not depend on the number of processes.
-    groups = np.array_split(np.arange(len(robots)), -(-len(robots) // maker.at_once))
-    tasks = [_Task([robots[i] for i in group], n, maker, folder, episode_length) for group in groups]
+    # Products of another size round otherwise, so that batches must not depend on the number of processes.
+    batches = np.array_split(np.arange(len(robots)), -(-len(robots) // maker.batch_size))
+    tasks = [_Task([robots[i] for i in batch], n, maker, folder, episode_length) for batch in batches]
     parts: dict[int, Transitions] = {}
     for here in (True, False):
         some = [task for task in tasks if task.stays_here == here]
         calls = (delayed(_in_process)(task, os.getpid()) for task in some)
-        for of_group in as_completed(calls, n_jobs=1 if here else n_jobs):
-            parts |= of_group
-            for _ in of_group:
+        for of_batch in as_completed(calls, n_jobs=1 if here else n_jobs):
+            parts |= of_batch
+            for _ in of_batch:
                 callback(n)
     arrays = {
         name: np.concatenate([getattr(parts[i], name) for i in range(len(envs))])
@@ -86,14 +86,14 @@ def collect(
 
 @dataclass(frozen=True)
 class _OneByOne:
-    """Has a policy of one situation act for a group of one."""
+    """Has the policy of one situation act for a batch of one."""
 
     make_policy: MakePolicy
-    at_once: int = 1
+    batch_size: int = 1
 
-    def together(
+    def batched(
         self, envs: Sequence[gym.Env[Any, Any]], situations: Sequence[int], rng: np.random.Generator
-    ) -> Together:
+    ) -> BatchPolicy:
         policy = self.make_policy(envs[0], situations[0], rng)
         return lambda obs, episode_start: np.asarray(policy(obs[0], bool(episode_start[0])))[None]
 
@@ -110,11 +110,11 @@ class _Robot:
 
 @dataclass(frozen=True)
 class _Task:
-    """The transitions of a group of robots, to be collected side by side or to be read where that was done before."""
+    """The transitions of a batch of robots, to be collected side by side or to be read where that was done before."""
 
     robots: Sequence[_Robot]
     n: int
-    maker: MakeTogether
+    maker: MakeBatchPolicy
     folder: Path | None
     episode_length: int
 
@@ -156,26 +156,27 @@ class _Task:
         with ExitStack() as stack:
             envs = [stack.enter_context(opened(robot.source, robot.situation)) for robot in self.robots]
             rng = np.random.default_rng(self.robots[0].sequence)
-            policy = self.maker.together(envs, [robot.index for robot in self.robots], rng)
-            lives = [_Life(env, robot, self.episode_length) for env, robot in zip(envs, self.robots, strict=True)]
+            policy = self.maker.batched(envs, [robot.index for robot in self.robots], rng)
+            rollouts = [_Rollout(env, robot, self.episode_length) for env, robot in zip(envs, self.robots, strict=True)]
             for _ in range(self.n):
-                actions = policy(np.stack([life.obs for life in lives]), np.array([life.begins for life in lives]))
-                for life, action in zip(lives, actions, strict=True):
-                    life.step(action)
-            return [life.transitions() for life in lives]
+                obs = np.stack([rollout.obs for rollout in rollouts])  # (B, obs_dim)
+                actions = policy(obs, np.array([rollout.episode_start for rollout in rollouts]))
+                for rollout, action in zip(rollouts, actions, strict=True):
+                    rollout.step(action)
+            return [rollout.transitions() for rollout in rollouts]
 
 
-class _Life:
-    """What a robot goes through, episode after episode.
+class _Rollout:
+    """Steps a robot through one episode after the other, and keeps its transitions.
 
     Attributes:
         obs: Where it is, (obs_dim,).
-        begins: Whether an episode begins there.
+        episode_start: Whether an episode begins there.
     """
 
     def __init__(self, env: gym.Env[Any, Any], robot: _Robot, episode_length: int) -> None:
         self._env, self._robot, self._episode_length = env, robot, episode_length
-        self._watch, self._age, self.begins = Watch(env), 0, True
+        self._watch, self._age, self.episode_start = Watch(env), 0, True
         self._rows: list[tuple[Array, Array, float, Array]] = []
         self._ended: list[bool] = []
         with in_situation(robot.situation):
@@ -190,8 +191,9 @@ class _Life:
             self._rows.append((self.obs, action, step.reward, step.obs))
             self._ended.append(step.terminated)
             self._age += 1
-            self.obs, self.begins = step.obs, step.terminated or step.truncated or self._age == self._episode_length
-            if self.begins:
+            self.obs, too_long = step.obs, self._age == self._episode_length
+            self.episode_start = step.terminated or step.truncated or too_long
+            if self.episode_start:
                 (self.obs, _), self._age = gate.reset(self._env), 0
 
     def transitions(self) -> Transitions:

@@ -21,11 +21,11 @@ from famle_agent.planning import Planner, shift
 
 __all__ = [
     "REWARDS",
+    "BatchPolicy",
     "HeldUniformPolicy",
+    "MakeBatchPolicy",
     "MakePolicy",
-    "MakeTogether",
     "PlanningPolicy",
-    "Together",
     "make_held_uniform",
     "make_planning",
     "reward_names",
@@ -33,8 +33,8 @@ __all__ = [
 
 Array = npt.NDArray[Any]
 
-_ROWS_AT_ONCE = 640
-"""Candidates times networks of a plan, after which a processor's cache is full, and more at once are no faster."""
+_CANDIDATES_AT_ONCE = 640
+"""Of all networks together: with more, what they compute leaves the processor's cache, and is no faster."""
 
 
 class Policy(Protocol):
@@ -44,7 +44,7 @@ class Policy(Protocol):
         """The action for an observation, in the environment's action space."""
 
 
-class Together(Protocol):
+class BatchPolicy(Protocol):
     """Chooses the actions of B robots at once."""
 
     def __call__(self, obs: Array, episode_start: Array) -> Array:
@@ -83,17 +83,17 @@ MakePolicy = Callable[[gym.Env[Any, Any], int, np.random.Generator], Policy]
 
 
 @runtime_checkable
-class MakeTogether(Protocol):
+class MakeBatchPolicy(Protocol):
     """Makes a policy for several situations, which are simulated side by side."""
 
     @property
-    def at_once(self) -> int:
+    def batch_size(self) -> int:
         """How many situations at most."""
 
-    def together(
+    def batched(
         self, envs: Sequence[gym.Env[Any, Any]], situations: Sequence[int], rng: np.random.Generator
-    ) -> Together:
-        """Makes the policy of some environments, given the index of each one's situation."""
+    ) -> BatchPolicy:
+        """Makes the policy of environments with the same spaces, given the index of each one's situation."""
 
 
 class HeldUniformPolicy:
@@ -133,7 +133,7 @@ class PlanningPolicy:
 
     @torch.no_grad()
     def __call__(self, obs: Array, episode_start: Array) -> Array:
-        """Plans from where the last plans left off, and anew where an episode begins; see :class:`Together`."""
+        """Plans from where the last plans left off, and anew where an episode begins; see :class:`BatchPolicy`."""
         state = torch.as_tensor(obs, dtype=torch.float32)  # (B, obs_dim)
         if self._plan is None:
             self._plan = state.new_zeros(len(state), self._planner.horizon, *self._space.shape)
@@ -148,10 +148,10 @@ class PlanningPolicy:
 
 
 @dataclass(frozen=True)
-class _Alone:
-    """A policy of one robot."""
+class _Single:
+    """The policy of a batch of one."""
 
-    policy: Together
+    policy: BatchPolicy
 
     def __call__(self, obs: Array, episode_start: bool) -> Array:
         action: Array = self.policy(obs[None], np.array([episode_start]))[0]
@@ -192,19 +192,19 @@ class make_planning:  # noqa: N801
     termination_fn: TerminationFn | None = None
 
     @property
-    def at_once(self) -> int:
+    def batch_size(self) -> int:
         """As many situations as keep a processor busy; no more, so that others are left for other processes."""
-        return max(1, _ROWS_AT_ONCE // (self.model.members * self.planner.candidates))
+        return max(1, _CANDIDATES_AT_ONCE // (self.model.members * self.planner.candidates))
 
     def __call__(self, env: gym.Env[Any, Any], situation: int, rng: np.random.Generator) -> Policy:
         """See :data:`MakePolicy`."""
-        return _Alone(self.together([env], [situation], rng))
+        return _Single(self.batched([env], [situation], rng))
 
     @torch.no_grad()
-    def together(
+    def batched(
         self, envs: Sequence[gym.Env[Any, Any]], situations: Sequence[int], rng: np.random.Generator
     ) -> PlanningPolicy:
-        """See :class:`MakeTogether`."""
+        """See :class:`MakeBatchPolicy`."""
         space: Any = envs[0].action_space
         scale = ActionScale.of(space, torch.device("cpu"))
         model = Simulator(self.model, self.model.embeddings_of(torch.tensor(situations)))
@@ -219,7 +219,7 @@ class make_planning:  # noqa: N801
 
 def _joint_reward(rewards: Sequence[RewardFn], model: Simulator) -> RewardFn:
     """Asks each robot's own reward function, which may know of a goal that others do not have."""
-    if all(reward == rewards[0] for reward in rewards):
+    if all(reward is rewards[0] for reward in rewards):
         return rewards[0]
 
     def reward_fn(obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:

@@ -192,11 +192,11 @@ def test_collecting_in_this_process_keeps_the_number_of_threads(backend: str) ->
 class InOrder:
     """Acts by how many robots are beside one, and by a number that all of them share."""
 
-    at_once: int = 2
+    batch_size: int = 2
 
-    def together(self, envs: Sequence[Any], situations: Sequence[int], rng: np.random.Generator) -> Any:
+    def batched(self, envs: Sequence[Any], situations: Sequence[int], rng: np.random.Generator) -> Any:
         def act(obs: Array, begins: Array) -> Array:
-            assert len(obs) == len(begins) == len(situations) <= self.at_once
+            assert len(obs) == len(begins) == len(situations) <= self.batch_size
             assert (begins == (obs[:, 1] == 0)).all()  # of each robot's own episode
             low, share = LOW + 0.5 * begins[:, None], rng.uniform(0.0, 0.5) + 0.1 * len(obs)
             return np.stack([low[i] + share * np.array([1.0, 0.1 * c]) for i, c in enumerate(situations)], dtype="f")
@@ -209,7 +209,7 @@ CLOCKS = [partial(Clock, length) for length in LENGTHS]
 CALLED = [f"clock {length}" for length in LENGTHS]
 
 
-def test_each_robot_of_a_group_lives_its_own_episodes() -> None:
+def test_each_robot_of_a_batch_lives_its_own_episodes() -> None:
     counts: list[int] = []
     data = collect(CLOCKS, CALLED, 11, InOrder(3), 0, counts.append)
     assert counts == [11] * 5
@@ -221,18 +221,18 @@ def test_each_robot_of_a_group_lives_its_own_episodes() -> None:
     np.testing.assert_array_equal(data.obs, alone.obs)  # each has the chance of its own environment
 
 
-def test_environments_that_exist_and_factories_are_put_into_the_same_groups() -> None:
+def test_environments_that_exist_and_factories_are_put_into_the_same_batches() -> None:
     made = [Clock(length) if i in (1, 4) else CLOCKS[i] for i, length in enumerate(LENGTHS)]
     assert_equal(collect(made, CALLED, 9, InOrder(), 0), collect(CLOCKS, CALLED, 9, InOrder(), 0))
 
 
 @pytest.mark.slow
-def test_processes_collect_groups_as_one_would() -> None:
+def test_processes_collect_batches_as_one_would() -> None:
     assert_equal(collect(CLOCKS, CALLED, 9, InOrder(), 0, n_jobs=2), collect(CLOCKS, CALLED, 9, InOrder(), 0))
 
 
 @given(st.sets(st.integers(0, 4)))
-def test_group_of_which_some_are_missing_is_collected_again_to_the_same(missing: set[int]) -> None:
+def test_batch_of_which_some_are_missing_is_collected_again_to_the_same(missing: set[int]) -> None:
     with TemporaryDirectory() as name:
         folder = Path(name)
         whole = collect(CLOCKS, CALLED, 6, InOrder(), 0, folder=folder)
@@ -271,14 +271,14 @@ class Failing(Clock):
 
 
 @pytest.mark.parametrize("how", ["raises", "no observation", "no reward", "no step", "a reset"])
-@pytest.mark.parametrize("at_once", [1, 3])
-def test_failing_environment_names_its_situation_and_all_are_closed(how: str, at_once: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("batch_size", [1, 3])
+def test_failing_environment_names_its_situation_and_all_are_closed(how: str, batch_size: int, tmp_path: Path) -> None:
     makers = [Counted, partial(Failing, how), Counted]
     with pytest.raises((ZeroDivisionError, ValueError), match="in the situation 'bent'") as raised:
-        collect(makers, ["straight", "bent", "short"], 9, InOrder(at_once), 0, folder=tmp_path)
+        collect(makers, ["straight", "bent", "short"], 9, InOrder(batch_size), 0, folder=tmp_path)
     assert isinstance(raised.value, ZeroDivisionError) == (how == "raises")
     assert all(env.closed for env in Counted.made)
-    assert sorted(file.name for file in tmp_path.iterdir()) == (["situation-000.npz"] if at_once == 1 else [])
+    assert sorted(file.name for file in tmp_path.iterdir()) == (["situation-000.npz"] if batch_size == 1 else [])
 
 
 def test_environment_that_cannot_be_made_names_its_situation() -> None:

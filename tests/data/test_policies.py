@@ -182,7 +182,7 @@ def test_planned_action_lies_in_the_action_space(low: float, high: float) -> Non
 def test_robots_plan_together_each_for_its_situation_and_its_own_goal(planner: Any) -> None:
     goals = [(3.0, -3.0), (3.0, -3.0), (-3.0, 3.0), (-3.0, -3.0)]
     make = make_planning(plane_model(members=2), planner, None)
-    policy = make.together([Plane(goal) for goal in goals], [0, 1, 0, 1], np.random.default_rng(0))
+    policy = make.batched([Plane(goal) for goal in goals], [0, 1, 0, 1], np.random.default_rng(0))
     actions = policy(np.zeros((4, 2), np.float32), np.ones(4, dtype=bool))
     assert actions.dtype == np.float32
     signs = np.array([[1.0, -1.0], [-1.0, 1.0], [-1.0, 1.0], [1.0, 1.0]])
@@ -197,7 +197,7 @@ def test_episode_that_begins_voids_the_plan_of_its_own_robot_alone() -> None:
 
     starts: list[Tensor] = []
     make = make_planning(plane_model(), Recorder(4, candidates=20, iterations=2), None)
-    policy = make.together([Plane((3.0, 3.0)), Plane((-3.0, 3.0))], [0, 0], np.random.default_rng(0))
+    policy = make.batched([Plane((3.0, 3.0)), Plane((-3.0, 3.0))], [0, 0], np.random.default_rng(0))
     for begins in ([True, True], [False, True]):
         policy(np.zeros((2, 2), np.float32), np.array(begins))
     assert starts[0].abs().max() == 0
@@ -215,12 +215,12 @@ def test_rewards_of_robots_may_be_numbers_and_numpy_arrays() -> None:
             return super().reward_fn(obs, action, next_obs).numpy()
 
     make = make_planning(plane_model(), PLANNERS[0], None)
-    policy = make.together([Odd(), Numpy((3.0, -3.0))], [0, 0], np.random.default_rng(0))
+    policy = make.batched([Odd(), Numpy((3.0, -3.0))], [0, 0], np.random.default_rng(0))
     action = unit(policy(np.zeros((2, 2), np.float32), np.ones(2, dtype=bool))[1])
     assert action[0] > 0.5
     assert action[1] < -0.5
 
 
-@pytest.mark.parametrize(("candidates", "members", "at_once"), [(32, 4, 5), (10_000, 1, 1), (8, 2, 40)])
-def test_plans_that_are_large_are_made_one_by_one(candidates: int, members: int, at_once: int) -> None:
-    assert make_planning(plane_model(members), ICEM(4, candidates=candidates), None).at_once == at_once
+@pytest.mark.parametrize(("candidates", "members", "batch_size"), [(32, 4, 5), (10_000, 1, 1), (8, 2, 40)])
+def test_plans_that_are_large_are_made_one_by_one(candidates: int, members: int, batch_size: int) -> None:
+    assert make_planning(plane_model(members), ICEM(4, candidates=candidates), None).batch_size == batch_size
