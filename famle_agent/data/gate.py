@@ -15,7 +15,6 @@ import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-
 __all__ = [
     "Step",
     "VecStep",
