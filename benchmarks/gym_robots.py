@@ -308,10 +308,11 @@ def run(method: str, name: str, seed: int, lives: int, cache: Path, change: tupl
 def summary(results: pd.DataFrame) -> pd.DataFrame:
     """Takes median, worst and best over meta-trainings, unseen robots and lives, and the median of each robot."""
     table = pd.DataFrame(list(results["returns"]), index=results["method"])
-    returns = table.stack().explode().astype(float)  # by method and robot
+    lives = table.melt(ignore_index=False, var_name="robot", value_name="return").explode("return")
+    lives = lives.astype({"return": float})
     methods = [method for method in (*METHODS, *LONG) if method in table.index]
-    over_all = returns.groupby(level=0).agg(["median", "min", "max"])
-    of_each = returns.groupby(level=[0, 1]).median().unstack()[table.columns]
+    over_all = lives.groupby(level=0)["return"].agg(["median", "min", "max"])
+    of_each = lives.pivot_table("return", index="method", columns="robot", aggfunc="median")[table.columns]
     return over_all.join(of_each).loc[methods]
 
 
