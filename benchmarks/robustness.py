@@ -241,21 +241,25 @@ PARTS: Mapping[str, Callable[[Args], Iterator[Row]]] = {
 
 
 def repeated(tried: str, times: int, once: Callable[[int], object]) -> Row:
-    """Does something again and again, and counts what is left of it; a fifth of the time fills caches."""
-    memory, first = np.zeros(times), dict[str, int]()
+    """Does something again and again, and counts what is left of it each time; a fifth of the time fills caches.
+
+    What is left counts where it grows in the first half of what follows and in the second one: a leak does so, and a
+    cache that fills late does not.
+    """
+    memory, held, looks = np.zeros(times), list[dict[str, int]](), (times // 5, 3 * times // 5, times - 1)
     for i in range(times):
         once(i)
         memory[i] = _memory()
-        if i == times // 5:
-            first = _held()
-    last = _held()
-    more = {name: last[name] - first.get(name, 0) for name in last}
-    allowed = {"objects": times // 2}  # fewer than are left where each time leaves one
-    leaked = [f"{number} more {name}" for name, number in more.items() if number > allowed.get(name, 0)]
+        if i in looks:
+            held.append(_held())
+    first, middle, last = held
+    more = {name: min(last[name] - middle[name], middle[name] - first[name]) for name in last}
+    allowed = {"objects": times // 5}  # half of what is left in either part where each time leaves one
+    leaked = [f"{number} more {name}, twice" for name, number in more.items() if number > allowed.get(name, 0)]
     row = Row(tried, times, leaked + _grown(memory), {"memory growth": _growth(memory)})
     row.figures |= {"MB before": _median(memory, 1), "MB after": _median(memory, 4)}
     for name in last:
-        row.figures |= {f"{name} before": first.get(name, 0), f"{name} after": last[name]}
+        row.figures |= {f"{name} before": first[name], f"{name} after": last[name]}
     return row
 
 

@@ -84,7 +84,7 @@ def _other_each_time(folder: Path) -> str:
 @pytest.mark.slow
 def test_all_parts_are_tried_and_stored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     parts = tuple(part for part in PARTS if part not in ("interruptions", "files"))
-    main(Args(parts, steps=100, environments=15, learns=40, out=tmp_path))
+    main(Args(parts, steps=100, environments=15, learns=10, out=tmp_path))
     table = load(tmp_path / "robustness.csv")
     assert set(table["part"]) == set(parts)
     assert (table["wrong"] == 0).all()
@@ -93,7 +93,7 @@ def test_all_parts_are_tried_and_stored(tmp_path: Path, capsys: pytest.CaptureFi
 
 @pytest.mark.parametrize("part", [environments, pytest.param(learning, marks=pytest.mark.slow)])
 def test_robots_and_agents_are_let_go(part: Callable[[Args], Iterator[Row]]) -> None:
-    for row in part(Args(environments=16, learns=40)):
+    for row in part(Args(environments=16, learns=10)):
         assert [line for line in row.wrong if "memory" not in line] == [], row.tried  # which takes longer to settle
 
 
