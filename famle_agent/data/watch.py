@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import update_wrapper
+from traceback import walk_tb
 from typing import Any
 
 import gymnasium as gym
@@ -13,6 +13,7 @@ import numpy.typing as npt
 from stable_baselines3.common.vec_env import VecEnv
 
 from famle_agent.data.gate import VecStep, vec_step
+from famle_agent.utils.errors import add_note
 
 __all__ = ["VecWatch", "Watch"]
 
@@ -48,14 +49,9 @@ class Watch:
         return self._resets.calls
 
     @property
-    def steps(self) -> int:
-        """How often it was stepped."""
-        return self._steps.calls
-
-    @property
     def calls(self) -> int:
         """How often it was stepped or reset."""
-        return self.resets + self.steps
+        return self._resets.calls + self._steps.calls
 
 
 class VecWatch:
@@ -71,7 +67,8 @@ class VecWatch:
         self._base = [_counted(base, name) for name in ("reset", "step_wait")]
         inside = getattr(base, "envs", None)
         known = isinstance(inside, list) and len(inside) == env.num_envs
-        self._robots = [Watch(robot) for robot in inside] if known and inside is not None else []
+        self._envs: list[gym.Env[Any, Any]] = inside if known and inside is not None else []
+        self._robots = [Watch(robot) for robot in self._envs]
 
     @property
     def calls(self) -> int:
@@ -81,15 +78,23 @@ class VecWatch:
     def step(self, actions: npt.NDArray[Any]) -> tuple[VecStep, npt.NDArray[np.bool_]]:
         """Steps the robots; arguments and errors as of :func:`~famle_agent.data.gate.vec_step`.
 
-        What a robot raises has a note of its index where the robots are in this process.
+        What a robot raises, a wrapper of it included, has a note of its index where the robots are in this process.
 
         Returns:
             What they returned, and which of them were reset otherwise than by the end of their episode, (n,); none
             where they are in other processes.
         """
         before = self._resets()
-        with self._noting_who_fails():
+        try:
             step = vec_step(self._env, actions)
+        except Exception as error:
+            if (failed := _robot_in_traceback(self._envs, error)) is not None:
+                add_note(
+                    error,
+                    f"Robot {failed} of {len(self._envs)} raised it. Wrap each robot in famle_agent.TruncateOnError "
+                    "for the others to go on where one of them fails.",
+                )
+            raise
         resets = self._resets() - before
         return step, resets != step.dones if len(resets) else np.zeros_like(step.dones)
 
@@ -97,21 +102,12 @@ class VecWatch:
         """How often each robot was reset, (n,); (0,) where they are in other processes."""
         return np.array([robot.resets for robot in self._robots], dtype=np.int64)
 
-    @contextmanager
-    def _noting_who_fails(self) -> Iterator[None]:
-        """Adds a note to an exception of a step: which robot was stepped last, and how the others would go on."""
-        before = [robot.steps for robot in self._robots]
-        try:
-            yield
-        except Exception as error:
-            stepped = [i for i, robot in enumerate(self._robots) if robot.steps > before[i]]
-            if stepped:
-                note = (
-                    f"Robot {stepped[-1]} of {len(before)} was stepped last. Wrap each robot in "
-                    "famle_agent.TruncateOnError for the others to go on where one of them fails."
-                )
-                error.__notes__ = [*getattr(error, "__notes__", ()), note]  # add_note is of Python 3.11
-            raise
+
+def _robot_in_traceback(envs: Sequence[gym.Env[Any, Any]], error: Exception) -> int | None:
+    """Finds the environment through a method of which an exception came; None where it came from elsewhere."""
+    index = {id(env): i for i, env in enumerate(envs)}
+    through = (index.get(id(frame.f_locals.get("self"))) for frame, _ in walk_tb(error.__traceback__))
+    return next((i for i in through if i is not None), None)
 
 
 def _counted(robot: Any, name: str) -> _Counted:

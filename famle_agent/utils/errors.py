@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["NotLearnedError", "SensorError", "in_situation"]
+__all__ = ["NotLearnedError", "SensorError", "add_note", "in_situation"]
 
 
 class NotLearnedError(RuntimeError):
@@ -16,12 +16,16 @@ class SensorError(ValueError):
     """No robot has a sensor that can be believed, or the model's own prediction is too old to plan from."""
 
 
+def add_note(error: Exception, note: str) -> None:
+    """Adds a note to an exception, as the method of that name does, which Python 3.10 has not."""
+    vars(error).setdefault("__notes__", []).append(note)
+
+
 @contextmanager
 def in_situation(name: str) -> Iterator[None]:
     """Notes on an exception in which situation it was raised. Its type and its message stay as they are."""
     try:
         yield
     except Exception as error:
-        # As its method add_note does, which Python 3.10 has not.
-        vars(error).setdefault("__notes__", []).append(f"It was raised in the situation {name!r}.")
+        add_note(error, f"It was raised in the situation {name!r}.")
         raise

@@ -152,8 +152,8 @@ def test_exception_names_its_robot_and_leaves_what_is_believed() -> None:
     with pytest.raises(ConnectionError, match="the cable is loose") as caught:
         learned(agent, Failing)
     assert caught.value.__notes__ == [
-        f"Robot {BAD} of {ROBOTS} was stepped last. Wrap each robot in famle_agent.TruncateOnError for the others to "
-        "go on where one of them fails."
+        f"Robot {BAD} of {ROBOTS} raised it. Wrap each robot in famle_agent.TruncateOnError for the others to go on "
+        "where one of them fails."
     ]
     believed = [agent.posterior(robot=robot) for robot in range(ROBOTS)]
     assert believed[0] != believed[1]

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import Tensor
 
 from famle_agent import FAMLE, FAMLEWrapper, OnlineState
-from famle_agent.data.watch import Watch
+from famle_agent.data.watch import VecWatch, Watch
 from famle_agent.training.policy_search import PolicySearch, Search
 from tests.clock import Clock, collected
 
@@ -191,6 +191,38 @@ def test_watched_robot_can_be_copied_and_stored() -> None:
         assert Watch(copy).calls == 3
     assert (watch.resets, watch.calls, robot.clock) == (1, 1, 0)
     assert Watch(gym.wrappers.TimeLimit(robot, 3)).calls == 1  # whoever looks, counts the same
+
+
+class Broken(gym.Wrapper[Any, Any, Any, Any]):
+    """Raises before or behind a step of the robot."""
+
+    def __init__(self, behind: bool) -> None:
+        super().__init__(Counter())
+        self.behind = behind
+
+    def step(self, action: Any) -> Any:
+        if self.behind:
+            self.env.step(action)
+        raise ConnectionError("the cable is loose")
+
+
+@pytest.mark.parametrize("behind", [False, True])
+@pytest.mark.parametrize("bad", [0, 1, 2])
+def test_what_a_wrapper_raises_names_its_robot(bad: int, behind: bool) -> None:
+    robots = [(lambda: Broken(behind)) if i == bad else Counter for i in range(3)]
+    env = DummyVecEnv(robots)
+    env.reset()
+    with pytest.raises(ConnectionError, match=rf"the cable is loose\nRobot {bad} of 3 raised it\."):
+        VecWatch(env).step(np.tile(NOTHING, (3, 1)))
+
+
+def test_what_no_robot_raises_names_none() -> None:
+    env = DummyVecEnv([Counter] * 3)
+    env.reset()
+    env.step_wait = lambda: None  # type: ignore[method-assign, assignment, return-value]
+    with pytest.raises(TypeError) as caught:
+        VecWatch(env).step(np.tile(NOTHING, (3, 1)))
+    assert not hasattr(caught.value, "__notes__")
 
 
 def test_watching_passes_gymnasiums_own_check(agent: FAMLE, make_env: MakeEnv) -> None:
