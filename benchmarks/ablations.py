@@ -39,8 +39,8 @@ PIECES: Mapping[str, Mapping[str, Any]] = {
     "nearest embedding": {"adapt_steps": 0, "compose": False, "posterior_sampling": False},
     "frozen": {"adapt_every": 0},
 }
-"""What is taken away: sums of embeddings; evidence that is tempered; members that start from different situations;
-gradient steps that go on; all gradient steps; all three; all adaptation."""
+"""What is taken away: nothing; sums of embeddings; evidence that is tempered; members that start from different
+situations; gradient steps that go on; all gradient steps; these, sums and different starts; all adaptation."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,12 @@ class Args(Options):
     robots: tuple[str, ...] = tuple(robots(Path()))
     """Our robots, and beds of benchmarks.gym_robots."""
     pieces: tuple[str, ...] = tuple(PIECES)
-    """What is taken away."""
+    """What is taken away; the others are compared with "all", which runs too."""
+
+    def __post_init__(self) -> None:
+        for names, known in ((self.robots, robots(self.cache)), (self.pieces, PIECES)):
+            if unknown := set(names) - set(known):
+                raise ValueError(f"There is no {', '.join(unknown)}. Known: {', '.join(known)}.")
 
 
 def run(robot: str, piece: str, number: int, cache: Path) -> list[Result]:
@@ -152,7 +157,7 @@ def main(args: Args) -> None:
         table, n = args.out / f"ablations-{robot}.csv", robots(args.cache)[robot].replicates
         batches = [
             Batch(piece, (number,), partial(run, robot, piece, number, args.cache))
-            for piece in args.pieces
+            for piece in dict.fromkeys(("all", *args.pieces))
             for number in range(n)
         ]
         run_batches(batches, table, args.jobs, args.backend)

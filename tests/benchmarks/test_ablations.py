@@ -26,9 +26,16 @@ def test_every_piece_can_be_taken_from_a_robot(robot: str, tmp_path: Path) -> No
         assert (changed == whole) == (piece == "all")
 
 
+def test_what_is_unknown_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"There is no dog\. Known: reacher, ant"):
+        Args(robots=("dog",))
+    with pytest.raises(ValueError, match=r"There is no luck\. Known: all, no sums"):
+        Args(pieces=("luck",))
+
+
 @pytest.mark.slow
 def test_what_is_stored_is_not_run_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    args = Args(robots=("quadruped",), pieces=("all", "frozen"), jobs=1, out=tmp_path, cache=tmp_path)
+    args = Args(robots=("quadruped",), pieces=("frozen",), jobs=1, out=tmp_path, cache=tmp_path)
     main(args)
     table = load(tmp_path / "ablations-quadruped.csv")
     assert set(table["method"]) == {"all", "frozen"}
