@@ -187,7 +187,7 @@ def live(env: FAMLEWrapper, schedule: Array, seed: int) -> Array:
 
 
 def recovery(rewards: Array, window: int, later: int) -> int:
-    """Counts the steps after a change until a robot has recovered, as the module says.
+    """Counts the steps after a change until a robot has recovered, as the module says; all of them where it has not.
 
     Args:
         rewards: Since the change is complete, (steps,).

@@ -179,7 +179,7 @@ class Args(Options):
 
 
 class Actor:
-    """What chooses actions on a robot, by its observations: at random, unless a heir does better."""
+    """Chooses actions on a robot by its observations: at random, unless a subclass does better."""
 
     def begin(self, env: Env) -> Env:
         """Takes over a new robot, whose actions it is to choose."""

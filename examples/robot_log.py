@@ -90,7 +90,7 @@ def read(path: Path) -> Iterator[tuple[Event, str]]:
     """Reads a log: what happened, and the situation that the agent believed in then.
 
     Raises:
-        ValueError: A line is no event; of a last line without an end, nothing is said.
+        ValueError: A line is no event; a last line that a crash cut off is left out.
     """
     for number, line in enumerate(path.read_text().splitlines(keepends=True), start=1):
         if not line.endswith("\n"):

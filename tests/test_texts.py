@@ -195,6 +195,7 @@ def test_readme_is_short_and_plain() -> None:
         "famle_agent.agents.baselines",
         "famle_agent.utils.parallel",
         "famle_agent.agents.famle",
+        "famle_agent.data.truncate_on_error",
         "famle_envs.situation",
         "famle_envs.faults",
         "famle_envs.reacher",

@@ -30,7 +30,7 @@ def close_when_let_go(logger: Logger) -> Logger:
 
 def _close(formats: Sequence[KVWriter]) -> None:
     for output in formats:
-        with suppress(OSError):  # of a folder that is gone, as whoever has written there knows
+        with suppress(OSError):  # the folder may have been removed
             output.close()
 
 

@@ -231,7 +231,7 @@ class OnlineAdaptation:
         """Learns from a step that ends here, and notes what became of it; arguments as of :meth:`learn`."""
         before, transitions = perception.sense(state, readings, moved)
         before = replace(before, senses=senses_of(before).dropping(~moved))
-        self.newest = self._told = None  # whose memory would be a third one
+        self.newest = self._told = None  # frees the memories of the last step before others are made
         start = time.perf_counter()
         after = perception.observe(before, transitions)
         self.newest = Experience(before, after, transitions, self._plan_ms, 1e3 * (time.perf_counter() - start))

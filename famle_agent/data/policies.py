@@ -26,6 +26,7 @@ __all__ = [
     "MakeBatchPolicy",
     "MakePolicy",
     "PlanningPolicy",
+    "Policy",
     "make_held_uniform",
     "make_planning",
     "reward_names",
@@ -41,14 +42,14 @@ class Policy(Protocol):
     """Chooses actions."""
 
     def __call__(self, obs: Array, episode_start: bool) -> Array:
-        """The action for an observation, in the environment's action space."""
+        """Chooses the action for an observation, in the environment's action space."""
 
 
 class BatchPolicy(Protocol):
     """Chooses the actions of B robots at once."""
 
     def __call__(self, obs: Array, episode_start: Array) -> Array:
-        """The actions for observations (B, obs_dim), (B, action_dim), in the environments' action space."""
+        """Chooses actions (B, action_dim) in the environments' action space, for observations (B, obs_dim)."""
 
 
 REWARDS = ("planning_reward_fn", "reward_fn")

@@ -19,7 +19,7 @@ Array = npt.NDArray[Any]
 
 
 class TruncateOnError(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArgs):
-    """Truncates the episode of a robot whose ``step`` or ``reset`` raises an exception, or returns what is none.
+    """Truncates the episode of a robot whose ``step`` or ``reset`` raises an exception, or returns something malformed.
 
     A vector environment passes an exception on, which ends the steps of all its robots. With this wrapper around each,
     the one that fails has an observation of NaN and the reward 0, ``info["error"]`` says why, and the others go on. The
@@ -35,7 +35,7 @@ class TruncateOnError(gym.Wrapper[Array, Array, Array, Array], RecordConstructor
         errors: How often the robot has failed.
 
     Raises:
-        ValueError: Observations are no Box of floats, which have no NaN.
+        ValueError: Observations are no Box of floats; only these can be NaN.
 
     Example:
         >>> from famle_agent import TruncateOnError
