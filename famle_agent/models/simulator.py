@@ -26,7 +26,7 @@ class Simulator:
     """Predicts as :meth:`Dynamics.predict` does, for B robots whose theta and h do not change.
 
     What h does to the first layer, the normalisation and the choice of features become part of the weights. Robots with
-    theta_meta share all other layers: they are no copies, and one product is of all robots.
+    theta_meta share all other layers, so that one matrix product serves all of them.
 
     Args:
         model: Says what the parameters mean.
@@ -80,10 +80,9 @@ class Simulator:
     def rows(self, values: Tensor) -> Tensor:
         """Turns values of each member of each robot, (B, P, ...) or (B, 1, ...), into rows as an objective sees them.
 
-        The networks of robots that share theirs follow each other.
-
         Returns:
-            A row for each member of each robot, (B * P, ...).
+            A row for each member of each robot, (B * P, ...): row member * B + robot where robots share their networks,
+            else robot * P + member.
         """
         values = values.expand(-1, self._members, *values.shape[2:])
         return (values.transpose(0, 1) if self._shares else values).flatten(0, 1)

@@ -16,7 +16,7 @@ ENGINES = ("pybullet", "mujoco")
 _WITH_PYBULLET = '`pip install "famle[pybullet]"`, which needs a compiler where PyBullet has no wheel.'
 _REMEDIES = {
     "pybullet": f"{_WITH_PYBULLET} Without the argument `engine`, the robot runs in the engine that is installed.",
-    "pybullet_data": f"{_WITH_PYBULLET} It describes this robot to each engine.",
+    "pybullet_data": f"{_WITH_PYBULLET} Both engines read this robot's description from that package.",
     "mujoco": "`pip install mujoco`.",
 }
 """What to do where a package is not installed, by its name."""
