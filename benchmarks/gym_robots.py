@@ -177,6 +177,11 @@ class Args(Options):
     change: tuple[str, ...] = ()
     """Settings of FAMLE to change, such as policy_steps=100000; the table gets them into its name."""
 
+    def __post_init__(self) -> None:
+        for names, known in ((self.beds, tuple(BEDS)), (self.methods, METHODS + LONG)):
+            if unknown := set(names) - set(known):
+                raise ValueError(f"There is no {', '.join(unknown)}. Known: {', '.join(known)}.")
+
 
 class Actor:
     """Chooses actions on a robot by its observations: at random, unless a subclass does better."""

@@ -47,6 +47,13 @@ def test_every_method_lives_on_each_unseen_robot(
     main(args)  # which has nothing left to do
 
 
+def test_what_is_unknown_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"There is no dog\. Known: halfcheetah"):
+        Args(beds=("dog",))
+    with pytest.raises(ValueError, match=r"There is no famle-forzen\. Known: famle, famle-frozen"):
+        Args(methods=("famle-forzen",))
+
+
 def test_summary_is_over_meta_trainings_robots_and_lives() -> None:
     returns = [{"a": [1.0, 2.0], "b": [9.0, 4.0]}, {"a": [3.0, 3.0], "b": [8.0, 5.0]}]
     found = summary(pd.DataFrame({"method": ["famle", "famle"], "returns": returns})).loc["famle"]
