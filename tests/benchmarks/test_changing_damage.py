@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.changing_damage import CHANGES, FLICKER, Args, faults, main, ramp, recovery, summary
+from benchmarks.changing_damage import BEDS, CHANGES, FLICKER, Args, faults, main, ramp, recovery, summary
 from benchmarks.results import load
 from famle_envs import Situation
 
+ROOT = Path(__file__).parents[2]
 INTACT, FIRST, SECOND = np.ones(3), np.array([1.0, 0.0, 1.0]), np.array([-1.0, 1.0, 1.0])
 
 
@@ -83,3 +85,13 @@ def test_summary_has_means_by_robot_and_kind() -> None:
     table = pd.DataFrame({"method": ["a", "a", "b"], "recovery": [[0, 2], [4, 4], [1, 1]]})
     table["levels"] = [[1.0, 2.0, 3.0], [3.0, 4.0, 5.0], [1.0, 1.0, 1.0]]
     assert summary(table).to_numpy().tolist() == [[2, 3, 2, 3, 4, 2], [1, 1, 1, 1, 1, 1]]
+
+
+def test_manual_quotes_the_stored_results() -> None:
+    section = (ROOT / "docs" / "results.md").read_text().partition("## Damage that changes")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| (?:arm|ant|HalfCheetah): [^|]*\|(.*)\|$", section, re.MULTILINE)
+    quoted = [[float(cell) for cell in row.split("|")] for row in rows]
+    stored = summary(load(ROOT / "benchmarks" / "results" / "changing-damage.csv")).drop(columns="robots")
+    wanted = stored.loc[[f"{robot}, {change}" for robot in BEDS for change in CHANGES]].to_numpy(dtype=float)
+    np.testing.assert_allclose(np.array(quoted)[:, :2], wanted[:, :2], atol=0.0501)
+    np.testing.assert_allclose(np.array(quoted)[:, 2:], wanted[:, 2:], atol=0.0051)
