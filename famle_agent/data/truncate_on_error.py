@@ -24,7 +24,8 @@ class TruncateOnError(gym.Wrapper[Array, Array, Array, Array], RecordConstructor
     A vector environment passes an exception on, which ends the steps of all its robots. With this wrapper around each,
     the one that fails has an observation of NaN and the reward 0, ``info["error"]`` says why, and the others go on. The
     vector environment then resets it. Where the reset fails as well, the robot is left alone until the next one, and
-    observes NaN. Nobody learns from that; ``agent.health(robot=i)`` counts it.
+    observes NaN; a ``TimeLimit`` around this wrapper asks for one. Nobody learns from that, and
+    ``agent.health(robot=i)`` counts it.
 
     Only an :class:`Exception` is caught: Ctrl-C still ends everything.
 
