@@ -16,8 +16,8 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,7 +36,7 @@ from benchmarks.results import provenance, store
 from benchmarks.runner import launch
 from famle_agent.agents.famle import FAMLE
 from famle_agent.agents.presets import known_robots
-from famle_envs.engines import ENGINES
+from famle_envs.engines import ENGINES, MissingPackageError
 
 GROWTH = 0.05
 """By how much of itself memory may grow from the second fifth of a long run to its last."""
@@ -197,19 +197,19 @@ def control(args: Args) -> Iterator[Row]:
 
 def environments(args: Args) -> Iterator[Row]:
     """Makes robots in all engines that are installed, and closes them."""
-    ids = [robot.env_id for robot in known_robots().values() if robot.env_id]
-    kinds = list(product(ids, [engine for engine in ENGINES if find_spec(engine)]))
 
-    def once(i: int) -> None:
-        env_id, engine = kinds[i % len(kinds)]
+    def once(env_id: str, engine: str, seed: int) -> None:
         env = gym.make(env_id, engine=engine)
-        env.reset(seed=i)
+        env.reset(seed=seed)
         env.step(env.action_space.sample())
         env.close()
 
-    for i in range(len(kinds)):  # what each reads but once, such as meshes
-        once(i)
-    yield repeated("make() and close()", args.environments, once)
+    kinds = list[tuple[str, str]]()
+    for env_id, engine in product([robot.env_id for robot in known_robots().values() if robot.env_id], ENGINES):
+        with suppress(MissingPackageError):
+            once(env_id, engine, seed=0)  # which reads what is read but once, such as meshes
+            kinds.append((env_id, engine))
+    yield repeated("make() and close()", args.environments, lambda i: once(*kinds[i % len(kinds)], seed=i))
 
 
 def learning(args: Args) -> Iterator[Row]:
