@@ -85,16 +85,16 @@ def ours(task: Callable[[int], Task], score: Callable[[Rollout], float], replica
     )
 
 
-def bed(name: str, seeds: int, cache: Path, change: tuple[str, ...] = ()) -> Robot:
-    """Describes a bed of Gymnasium's robots: all unseen robots of some meta-trainings."""
+def bed(name: str, seeds: int, cache: Path, change: tuple[str, ...] = (), lives: int = 3) -> Robot:
+    """Describes a bed of Gymnasium's robots: all unseen robots of some meta-trainings, some lives of each."""
     makes = list(gym_robots.BEDS[name]().test.values())
 
     def agent(number: int, settings: Mapping[str, Any]) -> ModelBasedAgent:
-        agent = gym_robots.agent_of("famle", name, number // len(makes), cache, change)
+        agent = gym_robots.agent_of("famle", name, number // (lives * len(makes)), cache, change)
         agent.config = agent.config.changed(**settings)
         return agent
 
-    return Robot(agent, lambda number: makes[number % len(makes)](), earned, seeds * len(makes))
+    return Robot(agent, lambda number: makes[number % len(makes)](), earned, seeds * lives * len(makes))
 
 
 def robots(cache: Path) -> Mapping[str, Robot]:
