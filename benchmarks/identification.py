@@ -26,9 +26,11 @@ from benchmarks.results import Result, provenance, store
 from benchmarks.runner import launch
 from benchmarks.task import Task
 from famle_agent import Transitions
-from famle_agent.adaptation.adapters import descend, select
-from famle_agent.adaptation.belief import Belief, Candidates, prior, window_posterior
+from famle_agent.adaptation.belief import Belief, prior
+from famle_agent.adaptation.candidates import Candidates
 from famle_agent.adaptation.memory import Memory
+from famle_agent.adaptation.posterior import window_posterior
+from famle_agent.adaptation.update import descend, select
 from famle_agent.agents.presets import known_robots
 from famle_agent.data.collect import collect
 from famle_agent.data.policies import make_held_uniform

@@ -35,9 +35,11 @@ from torch import Tensor
 from benchmarks.reporting.statistics import interquartile_mean
 from benchmarks.results import Result, provenance, store
 from benchmarks.runner import launch
-from famle_agent.adaptation.adapters import descend, select
-from famle_agent.adaptation.belief import Candidates, prior, window_posterior
+from famle_agent.adaptation.belief import prior
+from famle_agent.adaptation.candidates import Candidates
 from famle_agent.adaptation.memory import Memory
+from famle_agent.adaptation.posterior import window_posterior
+from famle_agent.adaptation.update import descend, select
 from famle_agent.app.plots import style
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import InnerLoop

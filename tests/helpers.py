@@ -18,9 +18,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from famle_agent import FAMLE, OnlineState, Transitions
-from famle_agent.adaptation.adapters import descend, select
-from famle_agent.adaptation.belief import Belief, Candidates, prior, window_posterior
+from famle_agent.adaptation.belief import Belief, prior
+from famle_agent.adaptation.candidates import Candidates
 from famle_agent.adaptation.memory import Memory
+from famle_agent.adaptation.posterior import window_posterior
+from famle_agent.adaptation.update import descend, select
 from famle_agent.models.dynamics import Dynamics, Theta
 from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.models.observation import DIMS, ObservationLayout

@@ -9,29 +9,23 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation.belief import (
-    Belief,
-    Candidates,
-    Evidence,
-    choose,
+from famle_agent.adaptation.belief import Belief, Evidence, prior, unadapted
+from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.memory import Memory
+from famle_agent.adaptation.posterior import (
+    expected_square,
     filtered_posterior,
-    prior,
-    systematic_sample,
-    unadapted,
     updated_bias,
     updated_excess,
     window_posterior,
 )
-from famle_agent.adaptation.memory import Memory, Sample, minibatches, whole_memory
 from famle_agent.adaptation.settings import Adaptation, Filter
+from famle_agent.adaptation.update import descend, gradient_steps, select  # noqa: F401 - callers may have them from here
 from famle_agent.models.dynamics import Dynamics
-from famle_agent.models.gradient_steps import InnerLoop
-from famle_agent.models.likelihood import trust
 from famle_agent.models.simulator import Simulator
 
-__all__ = ["EmbeddingAdapter", "GradientAdapter", "descend", "select"]
+__all__ = ["EmbeddingAdapter", "GradientAdapter"]
 
-_GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)  # multiples of it, less their whole part, fill [0, 1) evenly
 _EVERY_SITUATION = "every situation"
 
 
@@ -80,7 +74,8 @@ class EmbeddingAdapter:
         log_p, seen = self._log_density(belief, fresh), memory.weight.sum(dim=1)
         posterior = filtered_posterior(self.candidates, belief.log_posterior, log_p, how.hazard)
         bias = updated_bias(belief.bias, evidence.residual, seen)
-        excess = updated_excess(belief.excess, self._expected_square(belief, fresh), seen)
+        squared = expected_square(belief.posterior, fresh, belief.noise, self.model.degrees_of_freedom)
+        excess = updated_excess(belief.excess, squared, seen)
         return replace(belief, log_posterior=posterior, bias=bias, excess=excess).where(moved, belief)
 
     def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
@@ -114,13 +109,7 @@ class EmbeddingAdapter:
 
     def _log_density(self, belief: Belief, residual: Tensor) -> Tensor:
         """Computes log p of residuals (B, P, C, obs_dim) with the robot's own noise, (B, C)."""
-        return self.settings.likelihood_power * self.model.log_density(residual, _noise(belief).sqrt())
-
-    def _expected_square(self, belief: Belief, residual: Tensor) -> Tensor:
-        """Squares residuals (B, P, C, obs_dim), by how likely each candidate was before, (B, obs_dim)."""
-        squared = residual.square()
-        squared = squared * trust(squared / _noise(belief), self.model.degrees_of_freedom)
-        return (belief.posterior[:, None, :, None] * squared).sum(dim=2).mean(dim=1)
+        return self.settings.likelihood_power * self.model.log_density(residual, belief.noise.sqrt())
 
     def _has_changed(self, memory: Memory, candidate: Tensor) -> Tensor:
         """Says where a candidate (B,) explains what was seen, or the newest of it, better than what was believed, (B,).
@@ -186,81 +175,7 @@ class GradientAdapter:
         return {_EVERY_SITUATION: 1.0}
 
 
-def _noise(belief: Belief) -> Tensor:
-    """Returns the squared noise of each robot, (B, 1, 1, obs_dim); what was fitted in simulation is the least."""
-    return belief.excess.clamp(min=1.0)[:, None, None]
-
-
-def gradient_steps(model: Dynamics, start: Belief, memory: Memory, settings: Adaptation, seed: int) -> Belief:
-    """Takes k steps from where a belief is, on all of the memory or on minibatches of it (line 7)."""
-    if (steps := settings.gradient) is None:
-        return start
-    sample = _sample(steps.batch_size, seed, start.adaptations - 1, memory)
-    return descend(model, start, memory, steps.inner_loop(memory.seen), steps.validation_size, sample)
-
-
-def _sample(size: int, seed: int, number: int, memory: Memory) -> Sample:
-    """Chooses what the steps of an adaptation see; the same for the same number, so that equal states act alike."""
-    if not size:
-        return whole_memory
-    return minibatches(size, torch.Generator(memory.obs.device).manual_seed(1_000_003 * seed + number))
-
-
 def simulator_of(model: Dynamics, belief: Belief, memory: Memory, clamp: bool) -> Simulator:
     """Returns the dynamics of a belief; with ``clamp``, within the range of the memory once robots have adapted."""
     within = memory.range() if clamp and belief.adaptations > 0 else None
     return Simulator(model, belief.h, belief.theta, within)
-
-
-def select(model: Dynamics, candidates: Candidates, belief: Belief, spread: bool = False) -> Belief:
-    """Line 6: theta_meta with the most likely embedding, h_likely = argmax log p(D_M | theta_meta, h).
-
-    Args:
-        model: Holds theta_meta.
-        candidates: The embeddings to select from.
-        belief: Its posterior counts.
-        spread: Whether the members of the ensemble begin with candidates that are sampled from the posterior, others
-            each time, instead of all with the most likely one. A plan has to be good then in several situations that
-            may be the case, and a robot that is stuck tries what it would do in another one.
-    """
-    likeliest = belief.log_posterior.argmax(dim=1)  # (B,)
-    likely = likeliest[:, None]
-    if spread:
-        offset = belief.adaptations * _GOLDEN_RATIO % 1.0
-        likely = systematic_sample(belief.posterior, model.members, offset)  # (B, P)
-    theta_meta, h_likely = model.theta_of(len(likely)), candidates.chosen(likely)
-    new = replace(belief, theta=theta_meta, h=h_likely, candidate=likeliest)
-    return replace(new, adaptations=belief.adaptations + 1)
-
-
-@torch.no_grad()
-def descend(
-    model: Dynamics,
-    start: Belief,
-    memory: Memory,
-    inner_loop: InnerLoop,
-    validation_size: int = 0,
-    sample: Sample = whole_memory,
-) -> Belief:
-    """Line 7: theta*, h* = k gradient steps from where a belief is, each member of the ensemble by itself.
-
-    Args:
-        model: Says what the parameters mean.
-        start: Its theta and h are where the steps begin, and stay where they diverge, which is counted.
-        memory: D_M.
-        inner_loop: The k steps.
-        validation_size: The newest transitions, which no gradient step sees. Steps that do not make them more likely
-            are taken back, in each member of the ensemble by itself; 0 trusts all steps, as the paper does.
-        sample: Chooses the transitions of each step among those it may see.
-    """
-    if inner_loop.steps == 0:
-        return start
-    seen, newest = memory.split(validation_size)
-    theta, h, _ = inner_loop(model, start.theta, start.h, sample(model, seen))
-    if validation_size:
-        batch = whole_memory(model, newest)()
-        better = model.loss(batch, h, theta) < model.loss(batch, start.h, start.theta)  # (B, P)
-        theta = {name: choose(better, value, start.theta[name]) for name, value in theta.items()}
-        h = choose(better, h, start.h)
-    adapted = replace(start, theta=theta, h=h)
-    return adapted.where(adapted.is_finite(), replace(start, diverged=start.diverged + 1))

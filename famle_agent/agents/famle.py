@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, cast
 
 from famle_agent.adaptation.adapters import EmbeddingAdapter
-from famle_agent.adaptation.belief import Candidates
+from famle_agent.adaptation.candidates import Candidates
 from famle_agent.agents.agent import ModelBasedAgent
 
 __all__ = ["FAMLE"]

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from famle_agent import FAMLE, Transitions
-from famle_agent.adaptation.adapters import descend, select
 from famle_agent.adaptation.belief import Belief
 from famle_agent.adaptation.memory import Memory
+from famle_agent.adaptation.update import descend, select
 from famle_agent.data.action_scaling import to_action_space
 from famle_agent.models.simulator import Simulator
 

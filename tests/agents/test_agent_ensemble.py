@@ -13,7 +13,7 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from famle_agent import FAMLE, FAMLEWrapper, Transitions
-from famle_agent.adaptation.belief import Candidates
+from famle_agent.adaptation.candidates import Candidates
 from tests.helpers import run, some_observations
 
 MakeEnv = Callable[..., gym.Env[Any, Any]]

@@ -10,7 +10,7 @@ from benchmarks import identification
 from benchmarks.identification import ADAPTATIONS, CANDIDATES, Args, accuracy, log_likelihood, main
 from benchmarks.results import load
 from famle_agent import FAMLE, Transitions
-from famle_agent.adaptation.belief import Candidates
+from famle_agent.adaptation.candidates import Candidates
 from tests.helpers import simple_model
 
 

@@ -7,8 +7,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from famle_agent.adaptation.adapters import descend, select
-from famle_agent.adaptation.belief import Candidates, prior, window_posterior
+from famle_agent.adaptation.belief import prior
+from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.posterior import window_posterior
+from famle_agent.adaptation.update import descend, select
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.models.members import for_robots, with_members

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from famle_agent import FAMLE
-from famle_agent.adaptation.belief import Candidates, filtered_posterior
+from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.posterior import filtered_posterior
 from tests.helpers import run, simple_model
 
 hazards = st.floats(1e-6, 0.5)

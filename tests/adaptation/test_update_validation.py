@@ -8,9 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation.adapters import descend, select
-from famle_agent.adaptation.belief import Candidates, prior
+from famle_agent.adaptation.belief import prior
+from famle_agent.adaptation.candidates import Candidates
 from famle_agent.adaptation.memory import Memory
+from famle_agent.adaptation.update import descend, select
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
 from tests.helpers import memory_of, random_transitions, simple_model

@@ -8,8 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from famle_agent.adaptation.adapters import select
-from famle_agent.adaptation.belief import Candidates, prior, systematic_sample
+from famle_agent.adaptation.belief import prior
+from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.posterior import systematic_sample
+from famle_agent.adaptation.update import select
 from tests.helpers import simple_model
 
 

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from famle_agent.adaptation.belief import Candidates, prior
+from famle_agent.adaptation.belief import prior
+from famle_agent.adaptation.candidates import Candidates
 from famle_agent.models.dynamics import Batch, Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
 from tests.helpers import adapted, memory_of, models, random_transitions, simple_model

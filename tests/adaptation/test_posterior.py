@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from famle_agent import FAMLE, Transitions
-from famle_agent.adaptation.belief import Candidates, filtered_posterior, window_posterior
+from famle_agent.adaptation.candidates import Candidates
 from famle_agent.adaptation.memory import Memory
+from famle_agent.adaptation.posterior import filtered_posterior, window_posterior
 from tests.helpers import simple_model
 
 Load = Callable[..., FAMLE]

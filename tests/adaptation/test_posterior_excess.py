@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from famle_agent import FAMLE
 from famle_agent.adaptation.adapters import EmbeddingAdapter
-from famle_agent.adaptation.belief import Belief, updated_bias, updated_excess
+from famle_agent.adaptation.belief import Belief
 from famle_agent.adaptation.diagnosis import Diagnosis
 from famle_agent.adaptation.memory import Memory
+from famle_agent.adaptation.posterior import updated_bias, updated_excess
 from famle_agent.adaptation.settings import Adaptation, Filter, Window
 from famle_agent.models.dynamics import Dynamics
 from tests.helpers import random_transitions, simple_model
