@@ -1,4 +1,7 @@
-"""The two ways to adapt a meta-learned model: by its embeddings and gradient steps, or by gradient steps alone."""
+"""Two ways to adapt a meta-learned model (lines 4 to 7): by embeddings and gradient steps, or by gradient steps alone.
+
+Each is an :class:`~famle_agent.adaptation.controller.Adapter`. It holds no state: beliefs and memories go in and out.
+"""
 
 from __future__ import annotations
 
@@ -33,6 +36,11 @@ _EVERY_SITUATION = "every situation"
 class EmbeddingAdapter:
     """FAMLE's: the most likely embedding, or sum of two, then k gradient steps on theta and h.
 
+    Each transition is judged, and changes the posterior (:meth:`judge`, :meth:`infer`). Every K steps the posterior
+    selects an embedding, where gradient steps begin (:meth:`adapt`). With ``warm_start`` they go on from where the last
+    ones led. Then theta_meta with the most likely embedding competes with theta* and h*, by the likelihood of
+    transitions before a gradient step has seen them (:meth:`~famle_agent.adaptation.memory.Memory.gain`).
+
     Attributes:
         model: Holds theta_meta and H_meta, which must not change while the adapter is used.
         settings: How to adapt.
@@ -56,7 +64,10 @@ class EmbeddingAdapter:
         return prior(self.model, self.candidates, robots)
 
     def judge(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> Evidence:
-        """Judges a transition by theta_meta with each candidate, and by theta* and h* where steps go on from there."""
+        """Judges a transition by theta_meta with each candidate, and by theta* and h* where steps go on from there.
+
+        The log-likelihoods are l[t, c] of :mod:`~famle_agent.adaptation.posterior`, with the noise v of the filter.
+        """
         transition = self.model.encode(obs[:, None], action[:, None], next_obs[:, None])  # (B, 1, ...)
         residual = self.candidates.residuals(self.model, transition)[:, :, 0]  # (B, P, C, obs_dim)
         log_p = self._log_density(belief, residual)
@@ -67,10 +78,13 @@ class EmbeddingAdapter:
         return Evidence(residual, log_p, own)
 
     def infer(self, memory: Memory, belief: Belief, evidence: Evidence, moved: Tensor) -> Belief:
-        """Filters over all transitions where a hazard is set, else takes the likelihood of the last (the paper)."""
+        """Filters over all transitions where a hazard is set, else takes the likelihood of the last (the paper).
+
+        The equations and their symbols are in :mod:`~famle_agent.adaptation.posterior`.
+        """
         if not isinstance(how := self.settings.evidence, Filter):
             return replace(belief, log_posterior=window_posterior(self.candidates, memory))
-        fresh = evidence.residual - belief.bias
+        fresh = evidence.residual - belief.bias  # f, (B, P, C, obs_dim)
         log_p, seen = self._log_density(belief, fresh), memory.weight.sum(dim=1)
         posterior = filtered_posterior(self.candidates, belief.log_posterior, log_p, how.hazard)
         bias = updated_bias(belief.bias, evidence.residual, seen)
@@ -114,8 +128,9 @@ class EmbeddingAdapter:
     def _has_changed(self, memory: Memory, candidate: Tensor) -> Tensor:
         """Says where a candidate (B,) explains what was seen, or the newest of it, better than what was believed, (B,).
 
-        The second is the test of a change point by cumulative sums: of a robot that has just broken, most of the memory
-        still speaks for what it was.
+        With g of :meth:`~famle_agent.adaptation.memory.Memory.gain`: g[0] > 0, or max_j g[j] > -log(hazard). The second
+        is the test of a change point by cumulative sums: of a robot that has just broken, most of the memory still
+        speaks for what it was.
         """
         how, gain = self.settings.evidence, memory.gain(candidate)
         surprise = how.surprise if isinstance(how, Filter) else math.inf

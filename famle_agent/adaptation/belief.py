@@ -22,7 +22,7 @@ __all__ = ["Belief", "Evidence", "choose", "prior", "unadapted"]
 
 @dataclass(frozen=True)
 class Evidence:
-    """What one transition of each of B robots says.
+    """What one transition of each of B robots says about which candidate it is.
 
     Attributes:
         residual: Errors of each candidate in fitted deviations, (B, P, C, obs_dim).
@@ -43,8 +43,8 @@ class Belief:
         theta: theta*, in each of the P members of the ensemble, (B, P, ...).
         h: h*, (B, P, embedding_dim).
         log_posterior: Log P(candidate | memory) but for a constant, (B, C).
-        bias: The part of each candidate's errors that lasts, in fitted deviations, (B, P, C, obs_dim).
-        excess: Mean square of the rest of the robot's errors in each observed number, (B, obs_dim).
+        bias: b, the part of each candidate's errors that lasts, in fitted deviations, (B, P, C, obs_dim).
+        excess: e, mean square of the rest of the robot's errors in each observed number, (B, obs_dim).
         candidate: The candidate with which theta* and h* began, (B,).
         diverged: How many adaptations of each robot left the finite numbers and were taken back, (B,).
         adaptations: How often the robots have adapted.
@@ -71,7 +71,7 @@ class Belief:
 
     @property
     def noise(self) -> Tensor:
-        """Squared noise of each robot, (B, 1, 1, obs_dim); what was fitted in simulation is the least."""
+        """v, squared noise of each robot, (B, 1, 1, obs_dim); what was fitted in simulation is the least."""
         return self.excess.clamp(min=1.0)[:, None, None]
 
     def of(self, robot: int) -> Belief:

@@ -90,19 +90,23 @@ class OnlineState:
 
 
 class Adapter(Protocol):
-    """Turns what robots have gone through into the model that they plan with."""
+    """Turns what robots have gone through into the model that they plan with: lines 4 to 7 of Algorithm 2.
+
+    At each step :meth:`judge` and :meth:`infer` take the newest transition, and every K steps :meth:`adapt` takes the
+    memory. Before each plan :meth:`model_for` gives the dynamics.
+    """
 
     def initial(self, robots: int) -> Belief:
         """Returns what B robots believe before they have seen anything: theta_meta and a first embedding."""
 
     def judge(self, belief: Belief, obs: Tensor, action: Tensor, next_obs: Tensor) -> Evidence:
-        """Says what a transition of each robot speaks for."""
+        """Computes how well each candidate, and the adapted model, predict a transition of each robot, (B, dim)."""
 
     def infer(self, memory: Memory, belief: Belief, evidence: Evidence, moved: Tensor) -> Belief:
         """Updates the posterior by the newest transition of the robots that ``moved`` (B,)."""
 
     def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
-        """Takes lines 6 and 7 of Algorithm 2; returns what of the memory still counts then, too."""
+        """Selects an embedding (line 6), takes gradient steps (line 7), and returns what of the memory still counts."""
 
     def model_for(self, belief: Belief, memory: Memory) -> Simulator:
         """Returns the dynamics that a belief stands for."""

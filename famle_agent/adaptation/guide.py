@@ -1,4 +1,4 @@
-"""What a policy that was learnt in simulation tells a planner: plans to begin with, and what lies beyond their end."""
+"""What a policy learnt in simulation tells the planner (line 8): plans to begin with, and values beyond their end."""
 
 from __future__ import annotations
 

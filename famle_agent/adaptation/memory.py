@@ -1,4 +1,4 @@
-"""What robots have gone through, and which of it a gradient step sees."""
+"""D_M of Algorithm 2, the last M transitions (lines 9 and 10), and which of them a gradient step sees (line 7)."""
 
 from __future__ import annotations
 
@@ -105,7 +105,8 @@ class Memory:
     def begun_anew(self, rows: Tensor, candidate: Tensor) -> Memory:
         """The memory of robots that take their newest transitions for those of another situation.
 
-        They keep those since which that situation explains most more than they believed.
+        They keep those since which that situation explains most more than they believed, t >= argmax_j g[j] of
+        :meth:`gain`.
 
         Args:
             rows: Which robots do, (B,).
@@ -126,7 +127,11 @@ class Memory:
         return self.gain(candidate)[:, 0] > 0.0
 
     def gain(self, candidate: Tensor) -> Tensor:
-        """By how much a candidate (B,) explains the transitions from each of the newest W on better, (B, W)."""
+        """Computes by how much better a candidate (B,) explains the transitions from each of the newest W on, (B, W).
+
+        The cumulative sum ``g[j] = sum_(t >= j) (l[t, c] - l_own[t])``, where l is :attr:`log_p` and l_own
+        :attr:`own_log_p`: the evidence that the robot has been in situation c since transition j.
+        """
         return ((self.explained_by(candidate) - self.own_log_p) * self.judging).flip(1).cumsum(dim=1).flip(1)
 
     def explained_by(self, candidate: Tensor) -> Tensor:

@@ -1,4 +1,7 @@
-"""Which readings of a robot's sensors can be measurements, and where a robot is as long as none can."""
+"""Which readings of a robot's sensors can be measurements, and where a robot is as long as none can.
+
+What Algorithm 2 takes for s and s' comes from here; :mod:`~famle_agent.adaptation.perception` puts the two together.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a model is adapted on the robot; an alternative is a type."""
+"""The settings of Algorithm 2 but for its planner: how a model is adapted on the robot. An alternative is a type."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A model made fast for planning: its situation is fixed, and all that does not change is folded into the weights."""
+"""The adapted model made fast for planning (line 8): its situation is fixed, and folded into the weights."""
 
 from __future__ import annotations
 
