@@ -36,7 +36,7 @@ from benchmarks.runner import launch
 from benchmarks.stopwatch import growth_of, machine, medians, repeat
 from benchmarks.task import Task
 from famle_agent import FAMLE, AdaptationLog, FAMLEWrapper, ModelBasedAgent
-from famle_agent.adaptation.controller import OnlineState
+from famle_agent.adaptation.state import OnlineState
 from famle_agent.agents.presets import known_robots
 from famle_agent.agents.world_model import WorldModel
 from famle_agent.data.collect import collect

@@ -10,7 +10,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from famle_agent.adaptation.controller import OnlineState
+    from famle_agent.adaptation.state import OnlineState
     from famle_agent.agents.adaptation_log import AdaptationLog
     from famle_agent.agents.agent import ModelBasedAgent
     from famle_agent.agents.baselines import AMPC, AMPCMAML
@@ -49,7 +49,7 @@ _MODULES = {
     "ModelBasedAgent": "agents.agent",
     "Hyperparameters": "agents.config",  # deprecated
     "NotLearnedError": "utils.errors",
-    "OnlineState": "adaptation.controller",
+    "OnlineState": "adaptation.state",
     "SensorError": "utils.errors",
     "Transitions": "data.transitions",
     "TruncateOnError": "data.truncate_on_error",

@@ -15,78 +15,13 @@ from torch import Tensor
 from famle_agent.adaptation.belief import Belief, Evidence
 from famle_agent.adaptation.guide import Guide
 from famle_agent.adaptation.memory import Memory
-from famle_agent.adaptation.senses import Senses
+from famle_agent.adaptation.state import OnlineState
 from famle_agent.models.reward import Objective
 from famle_agent.models.simulator import Simulator
 from famle_agent.planning import Planner, shift
 from famle_agent.utils.deadline import Deadline
 
-__all__ = ["Adapter", "Controller", "OnlineState"]
-
-
-@dataclass(frozen=True)
-class OnlineState:
-    """What B robots carry from one step to the next, as a recurrent policy carries its hidden state. Immutable.
-
-    Attributes:
-        memory: The last M transitions.
-        belief: The adapted model.
-        plan: Where the next search for actions begins, (B, H, action_dim).
-        last: The observation and the action of the last step, (B, obs_dim) and (B, action_dim); None where
-            somebody else reports the transitions.
-        steps: Steps, of a single robot those on which it had a transition. Of several robots all count, since none may
-            change when the others adapt.
-        adapted_at: How many of them there were when the robots last adapted at the end of an episode.
-        senses: What the robots' sensors have said last; None where nobody has asked. No file holds it.
-    """
-
-    memory: Memory
-    belief: Belief
-    plan: Tensor
-    last: tuple[Tensor, Tensor] | None = None
-    steps: int = 0
-    adapted_at: int = 0
-    senses: Senses | None = None
-
-    @property
-    def robots(self) -> int:
-        """B."""
-        return len(self.plan)
-
-    def resized(self, memory_size: int, window: int, horizon: int) -> OnlineState:
-        """The same for another M, W and H."""
-        plan = torch.cat([self.plan, torch.zeros_like(self.plan[:, :1]).repeat(1, horizon, 1)], dim=1)[:, :horizon]
-        return replace(self, memory=self.memory.resized(memory_size, window), plan=plan)
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """What :meth:`to_tensors` leaves out, for a checkpoint."""
-        return {"steps": self.steps, "adaptations": self.belief.adaptations, "adapted_at": self.adapted_at}
-
-    def to_tensors(self) -> dict[str, Tensor]:
-        """All but :attr:`last` and the counts, for a checkpoint; files have robots and members in one axis."""
-        tensors = {f"theta.{name}": value.flatten(0, 1) for name, value in self.belief.theta.items()}
-        tensors |= {f"memory.{name}": value for name, value in vars(self.memory).items()}
-        names = ("log_posterior", "bias", "excess", "candidate", "diverged")
-        belief = {name: getattr(self.belief, name) for name in names}
-        return tensors | belief | {"h": self.belief.h.flatten(0, 1), "plan": self.plan}
-
-    @classmethod
-    def from_tensors(cls, tensors: dict[str, Tensor], steps: int, adaptations: int, adapted_at: int) -> OnlineState:
-        """The inverse of :meth:`to_tensors`; the counts are :attr:`counts`."""
-
-        def part(prefix: str) -> dict[str, Tensor]:
-            return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
-
-        log_posterior, candidate = tensors["log_posterior"], tensors["candidate"]
-        diverged = tensors.get("diverged", torch.zeros_like(candidate))  # files of version 0.1 do not count
-        excess = tensors.get("excess", torch.ones_like(tensors["memory.obs"][:, 0]))  # nor know of other noise
-        robots, members = len(candidate), len(tensors["h"]) // len(candidate)
-        bias = tensors.get("bias", excess.new_zeros(robots, members, log_posterior.shape[1], excess.shape[1]))
-        theta = {name: value.view(robots, -1, *value.shape[1:]) for name, value in part("theta.").items()}
-        h = tensors["h"].view(robots, -1, tensors["h"].shape[1])
-        belief = Belief(theta, h, log_posterior, bias, excess, candidate, diverged, adaptations)
-        return cls(Memory(**part("memory.")), belief, tensors["plan"], steps=steps, adapted_at=adapted_at)
+__all__ = ["Adapter", "Controller"]
 
 
 class Adapter(Protocol):

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation.controller import Controller, OnlineState
+from famle_agent.adaptation.controller import Controller
 from famle_agent.adaptation.senses import Senses, Sensors
+from famle_agent.adaptation.state import OnlineState
 from famle_agent.utils.deadline import Deadline
 from famle_agent.utils.errors import SensorError
 

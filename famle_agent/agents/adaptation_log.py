@@ -15,8 +15,8 @@ import torch
 from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
-from famle_agent.adaptation.controller import OnlineState
 from famle_agent.adaptation.perception import senses_of
+from famle_agent.adaptation.state import OnlineState
 from famle_agent.agents.held_out import Models, Step, Window
 from famle_agent.agents.online_adaptation import Experience
 from famle_agent.agents.pictures import Array, Path, draw_paths, draw_posterior, liveliest

@@ -21,8 +21,8 @@ from typing_extensions import Self
 
 from famle_agent.adaptation.adapters import EmbeddingAdapter, GradientAdapter
 from famle_agent.adaptation.belief import Belief
-from famle_agent.adaptation.controller import OnlineState
 from famle_agent.adaptation.diagnosis import Diagnosis
+from famle_agent.adaptation.state import OnlineState
 from famle_agent.agents.adaptation_log import AdaptationLog, log_belief
 from famle_agent.agents.config import Config
 from famle_agent.agents.logs import close_when_let_go, log_episodes, log_time

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation.controller import OnlineState
 from famle_agent.adaptation.perception import senses_of
+from famle_agent.adaptation.state import OnlineState
 from famle_agent.agents.online_adaptation import Experience
 from famle_agent.agents.pictures import Path
 from famle_agent.agents.policy import AdaptivePolicy

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation.controller import OnlineState
 from famle_agent.adaptation.perception import Perception, senses_of
 from famle_agent.adaptation.senses import Senses
+from famle_agent.adaptation.state import OnlineState
 from famle_agent.agents.policy import AdaptivePolicy
 from famle_agent.utils.deadline import Deadline
 from famle_agent.utils.errors import SensorError

@@ -14,11 +14,12 @@ from torch import Tensor
 
 from famle_agent.adaptation.adapters import EmbeddingAdapter, GradientAdapter
 from famle_agent.adaptation.belief import Belief
-from famle_agent.adaptation.controller import Adapter, Controller, OnlineState
+from famle_agent.adaptation.controller import Adapter, Controller
 from famle_agent.adaptation.guide import Guide
 from famle_agent.adaptation.memory import Memory
 from famle_agent.adaptation.perception import Perception
 from famle_agent.adaptation.senses import Sensors
+from famle_agent.adaptation.state import OnlineState
 from famle_agent.agents.config import Config
 from famle_agent.agents.world_model import Interface, ModelBuilder, WorldModel
 from famle_agent.data.objective import other_reward, planning_reward, planning_termination
