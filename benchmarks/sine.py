@@ -131,7 +131,7 @@ class Learner:
     seconds: float
 
     def fit(self, points: Memory) -> Tensor:
-        """Runs lines 6 and 7 of Algorithm 2, and predicts y on GRID for each of B sines, (B, 200)."""
+        """Runs lines 2 and 3 of Algorithm 2, and predicts y on GRID for each of B sines, (B, 200)."""
         sines, alone = len(points.weight), Candidates.of(self.model, compose=False)
         data = self.model.encode(points.obs, points.action, points.next_obs, points.weight)
         points = replace(points, log_p=alone.log_likelihood(self.model, data))

@@ -1,4 +1,4 @@
-"""Model-predictive control (line 8 of Algorithm 2): sequences of actions that a model believes to be good.
+"""Model-predictive control (line 4 of Algorithm 2): sequences of actions that a model believes to be good.
 
 A planner knows a function that judges candidate sequences, and nothing of what stands behind it.
 """

@@ -187,7 +187,7 @@ def memory_of(model: Dynamics, candidates: Candidates, obs: Tensor, action: Tens
 
 
 def adapted(model: Dynamics, candidates: Candidates, memory: Memory, inner_loop: InnerLoop) -> Belief:
-    """Algorithm 2, lines 6 and 7, for robots that have seen nothing but their memory."""
+    """Algorithm 2, lines 2 and 3, for robots that have seen nothing but their memory."""
     start = prior(model, candidates, len(memory.weight))
     likely = replace(start, log_posterior=window_posterior(candidates, memory))
     return descend(model, select(model, candidates, likely), memory, inner_loop)

@@ -1,4 +1,4 @@
-"""Two ways to adapt a meta-learned model (lines 4 to 7): by embeddings and gradient steps, or by gradient steps alone.
+"""Two ways to adapt a meta-learned model (lines 2 and 3): by embeddings and gradient steps, or by gradient steps alone.
 
 Each is an :class:`~famle_agent.adaptation.controller.Adapter`. It holds no state: beliefs and memories go in and out.
 """
@@ -93,7 +93,7 @@ class EmbeddingAdapter:
         return replace(belief, log_posterior=posterior, bias=bias, excess=excess).where(moved, belief)
 
     def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
-        """Selects the most likely embedding (line 6), then takes k gradient steps on theta and h (line 7)."""
+        """Selects the most likely embedding (line 2), then takes k gradient steps on theta and h (line 3)."""
         start = self._selected(belief)
         if self.settings.warm_start:
             changed = self._has_changed(memory, start.candidate) & (start.candidate != belief.candidate)

@@ -1,4 +1,4 @@
-"""The embeddings among which line 6 of Algorithm 2 selects: those of the training situations, and sums of two."""
+"""The embeddings among which line 2 of Algorithm 2 selects: those of the training situations, and sums of two."""
 
 from __future__ import annotations
 

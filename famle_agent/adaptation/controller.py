@@ -25,7 +25,7 @@ __all__ = ["Adapter", "Controller"]
 
 
 class Adapter(Protocol):
-    """Turns what robots have gone through into the model that they plan with: lines 4 to 7 of Algorithm 2.
+    """Turns what robots have gone through into the model that they plan with: lines 2 and 3 of Algorithm 2.
 
     At each step :meth:`judge` and :meth:`infer` take the newest transition, and every K steps :meth:`adapt` takes the
     memory. Before each plan :meth:`model_for` gives the dynamics.
@@ -41,7 +41,7 @@ class Adapter(Protocol):
         """Updates the posterior by the newest transition of the robots that ``moved`` (B,)."""
 
     def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
-        """Selects an embedding (line 6), takes gradient steps (line 7), and returns what of the memory still counts."""
+        """Selects an embedding (line 2), takes gradient steps (line 3), and returns what of the memory still counts."""
 
     def model_for(self, belief: Belief, memory: Memory) -> Simulator:
         """Returns the dynamics that a belief stands for."""
@@ -59,6 +59,15 @@ class Adapter(Protocol):
 @dataclass(frozen=True)
 class Controller:
     """Runs Algorithm 2.
+
+    The paper's lines are here::
+
+        2     the most likely embedding, given D_M and theta_meta     adapter.judge, .infer and .adapt
+        3     k gradient steps on theta and h from there              adapter.adapt
+        4     an action by MPC with theta* and h*                     act
+        5, 6  the transition goes into D_M, the oldest out of it      observe
+
+    Lines 2 and 3 run every K steps.
 
     Attributes:
         adapter: Says what robots believe.
@@ -79,13 +88,13 @@ class Controller:
     guide: Guide | None = None
 
     def init(self, belief: Belief, memory: Memory) -> OnlineState:
-        """Returns the state of B robots that believe what the adapter says, with an empty memory (line 1)."""
+        """Returns the state of B robots that believe what the adapter says, with an empty memory D_M."""
         robots, _, action_dim = memory.action.shape
         plan = memory.action.new_zeros(robots, self.planner.horizon, action_dim)
         return OnlineState(memory, belief, plan)
 
     def observe(self, state: OnlineState, obs: Tensor, starts: Tensor) -> OnlineState:
-        """Adds the transition that ends here to the memory (lines 9 and 10), and adapts every K (lines 4 to 7).
+        """Adds the transition that ends here to the memory (lines 5 and 6), and adapts every K (lines 2 and 3).
 
         Args:
             state: The state after the last action.
@@ -114,7 +123,7 @@ class Controller:
         generator: torch.Generator,
         deadline: Deadline | None = None,
     ) -> tuple[Tensor, OnlineState]:
-        """Plans an action in [-1, 1], (B, action_dim), with the adapted model (line 8) and by the deadline, if any."""
+        """Plans an action in [-1, 1], (B, action_dim), with the adapted model (line 4) and by the deadline, if any."""
         state = self.reset(state, starts)
         model = self.adapter.model_for(state.belief, state.memory)
         objective, proposals = self.objective, None

@@ -1,4 +1,4 @@
-"""What is most likely wrong with a robot, in words: the posterior of line 6, and how far that can be believed."""
+"""What is most likely wrong with a robot, in words: the posterior of line 2, and how far that can be believed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a policy learnt in simulation tells the planner (line 8): plans to begin with, and values beyond their end."""
+"""What a policy learnt in simulation tells the planner (line 4): plans to begin with, and values beyond their end."""
 
 from __future__ import annotations
 

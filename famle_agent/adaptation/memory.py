@@ -1,4 +1,4 @@
-"""D_M of Algorithm 2, the last M transitions (lines 9 and 10), and which of them a gradient step sees (line 7)."""
+"""D_M of Algorithm 2, the last M transitions (lines 5 and 6), and which of them a gradient step sees (line 3)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How likely each candidate is (line 6 of Algorithm 2): by the paper's window of transitions, or by a Bayesian filter.
+"""How likely each candidate is (line 2 of Algorithm 2): by the paper's window of transitions, or by a Bayesian filter.
 
 Errors are counted in the deviations that were fitted in simulation: r[t, p, c, d] is that of transition t in the
 observed number d, as predicted by member p of the ensemble with theta_meta and candidate c

@@ -69,7 +69,7 @@ class Epochs:
 
 @dataclass(frozen=True)
 class GradientSteps:
-    """The gradient steps of an adaptation (line 7 of Algorithm 2).
+    """The gradient steps of an adaptation (line 3 of Algorithm 2).
 
     Attributes:
         length: How many there are.

@@ -1,4 +1,4 @@
-"""Lines 6 and 7 of Algorithm 2: select the most likely embedding, then take k gradient steps on theta and h."""
+"""Lines 2 and 3 of Algorithm 2: select the most likely embedding, then take k gradient steps on theta and h."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)  # multiples of it, less their whol
 
 
 def select(model: Dynamics, candidates: Candidates, belief: Belief, spread: bool = False) -> Belief:
-    """Line 6: theta_meta with the most likely embedding, h_likely = argmax log p(D_M | theta_meta, h).
+    """Line 2: theta_meta with the most likely embedding, h_likely = argmax log p(D_M | theta_meta, h) (eq. 12).
 
     Args:
         model: Holds theta_meta.
@@ -42,7 +42,7 @@ def select(model: Dynamics, candidates: Candidates, belief: Belief, spread: bool
 
 
 def gradient_steps(model: Dynamics, start: Belief, memory: Memory, settings: Adaptation, seed: int) -> Belief:
-    """Takes k steps from where a belief is, on all of the memory or on minibatches of it (line 7)."""
+    """Takes k steps from where a belief is, on all of the memory or on minibatches of it (line 3)."""
     if (steps := settings.gradient) is None:
         return start
     sample = _sample(steps.batch_size, seed, start.adaptations - 1, memory)
@@ -65,7 +65,7 @@ def descend(
     validation_size: int = 0,
     sample: Sample = whole_memory,
 ) -> Belief:
-    """Line 7: theta*, h* = k gradient steps from where a belief is, each member of the ensemble by itself.
+    """Line 3: theta*, h* = k gradient steps from where a belief is, each member of the ensemble by itself.
 
     Args:
         model: Says what the parameters mean.

@@ -1,4 +1,8 @@
-"""The face that all our agents share with Stable-Baselines3's algorithms."""
+"""The face that all our agents share with Stable-Baselines3's algorithms: the part for the robot (Algorithm 2).
+
+``learn`` runs the loop; ``predict`` and ``observe`` leave it to somebody else. All three hand arrays over to
+:class:`~famle_agent.agents.online_adaptation.OnlineAdaptation` as tensors.
+"""
 
 from __future__ import annotations
 
@@ -274,7 +278,7 @@ class ModelBasedAgent(MetaLearningAgent):
                 starts = self._flags(self._last_episode_starts)
                 readings = self._tensor(vec_readings(self._last_obs, env))
                 self._last_obs = None  # the next learn() resets, should this step fail
-                action, state = online.act(perception, state, readings, starts, self.generator)  # line 8
+                action, state = online.act(perception, state, readings, starts, self.generator)  # line 4
                 try:
                     step, reset_alone = watch.step(to_action_space(action, self.action_space))
                 except BaseException:
@@ -282,7 +286,7 @@ class ModelBasedAgent(MetaLearningAgent):
                     raise
                 self.num_timesteps, self._calls = self.num_timesteps + env.num_envs, watch.calls
                 moved = self._flags(step.known & ~reset_alone)
-                state = online.learn(perception, state, self._tensor(step.reached), moved)  # lines 9, 10, then 4 to 7
+                state = online.learn(perception, state, self._tensor(step.reached), moved)  # lines 5, 6, then 2 and 3
                 # By names that callbacks know.
                 new_obs, rewards, dones, infos = step.obs, step.rewards, step.dones, step.infos
                 self._last_obs, self._last_episode_starts = new_obs, dones | reset_alone

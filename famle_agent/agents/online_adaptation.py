@@ -82,7 +82,7 @@ class OnlineAdaptation:
         generator: torch.Generator,
         deadline: Deadline | None = None,
     ) -> tuple[Tensor, OnlineState]:
-        """Plans from where robots are (line 8), and counts what was late.
+        """Plans from where robots are (line 4), and counts what was late.
 
         Args:
             perception: Algorithm 2, on robots whose sensors may fail.
@@ -108,7 +108,7 @@ class OnlineAdaptation:
         return planned
 
     def learn(self, perception: Perception, state: OnlineState, readings: Tensor, moved: Tensor) -> OnlineState:
-        """Learns from where the last action led (lines 9 and 10), and adapts every K steps (lines 4 to 7).
+        """Learns from where the last action led (lines 5 and 6), and adapts every K steps (lines 2 and 3).
 
         Args:
             perception: Algorithm 2, on robots whose sensors may fail.

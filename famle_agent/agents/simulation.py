@@ -1,4 +1,4 @@
-"""What is simulated to learn from."""
+"""The settings of what is simulated to learn from (lines 1 to 6 of Algorithm 1)."""
 
 from __future__ import annotations
 

@@ -257,7 +257,7 @@ class Dynamics(nn.Module):
         return self.layout.advance(_with_members(obs), change)
 
     def loss(self, batch: Batch, h: Tensor, theta: Theta | None = None) -> Tensor:
-        """Computes -log p of unit variance in each member, constants left out, (B, P): L(theta, h), eq. 6 of the paper.
+        """Computes -log p of unit variance in each member, constants left out, (B, P): L(theta, h), eq. 7 of the paper.
 
         A mean over the weighted transitions and over the target dimensions.
 

@@ -1,4 +1,4 @@
-"""U^k(theta, h): k gradient steps on the network and the embedding together (the paper's eq. 8 and 12).
+"""U^k(theta, h): k gradient steps on the network and the embedding together (the paper's eq. 9 and 13).
 
 Meta-learning and online adaptation share this rule, since the one learns the starting point of the other.
 """

@@ -1,4 +1,4 @@
-"""The adapted model made fast for planning (line 8): its situation is fixed, and folded into the weights."""
+"""The adapted model made fast for planning (line 4): its situation is fixed, and folded into the weights."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class Simulator:
 
 
 def imagine(model: Callable[[Tensor, Tensor], Tensor], objective: Objective, obs: Tensor, actions: Tensor) -> Tensor:
-    """Sums the rewards of candidate sequences in K models (the paper's eq. 13).
+    """Sums the rewards of candidate sequences in K models (the paper's eq. 14).
 
     Args:
         model: One step of many candidates: (K, N, obs_dim), (K, N, action_dim) -> next observations (K, N, obs_dim).

@@ -60,7 +60,7 @@ class Reptile:
         generator: torch.Generator,
         progress: Progress | None = None,
     ) -> Iterator[MetaStep]:
-        """Runs lines 8 to 14 of Algorithm 1 on ``model`` in place, an iteration a step; whoever has enough, stops.
+        """Runs lines 9 to 14 of Algorithm 1 on ``model`` in place, an iteration a step; whoever has enough, stops.
 
         Args:
             model: Randomly initialised model; its theta and embeddings become the meta-trained ones. With a single
