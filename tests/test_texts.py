@@ -154,6 +154,16 @@ def test_files_that_the_readme_names_are_there() -> None:
     assert {"reacher.py", "planning.py", "runner.py"} <= named
 
 
+def test_functions_that_the_manual_follows_are_where_it_says() -> None:
+    text = (ROOT / "docs/adaptation.md").read_text()
+    rows = re.findall(r"^\| (`[\w.`, ]+`) \| `([\w/]+\.py)` \|", text, re.MULTILINE)
+    assert len(rows) > 15
+    for names, file in rows:
+        source = (ROOT / "famle_agent" / file).read_text()
+        for name in re.findall(r"\w+", names):
+            assert re.search(rf"^\s*(?:def|class) {name}\b", source, re.MULTILINE), (name, file)
+
+
 def test_every_page_is_in_the_navigation() -> None:
     navigation = (ROOT / "mkdocs.yml").read_text()
     for text in TEXTS[1:]:

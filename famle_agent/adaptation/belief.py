@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -77,8 +78,8 @@ class Belief:
     def of(self, robot: int) -> Belief:
         """The belief about one robot alone, as of B = 1."""
         theta = {name: value[robot : robot + 1] for name, value in self.theta.items()}
-        names = ("h", "log_posterior", "bias", "excess", "candidate", "diverged")
-        return replace(self, theta=theta, **{name: getattr(self, name)[robot : robot + 1] for name in names})
+        rows: dict[str, Any] = {name: value[robot : robot + 1] for name, value in self._rows.items()}
+        return replace(self, theta=theta, **rows)
 
     def is_finite(self) -> Tensor:
         """Says for which robots all parameters are finite numbers, (B,)."""
@@ -87,16 +88,14 @@ class Belief:
 
     def where(self, kept: Tensor, other: Belief) -> Belief:
         """Takes this belief for the robots in ``kept`` (B,), and the other one for the rest."""
-        return Belief(
-            {name: choose(kept, value, other.theta[name]) for name, value in self.theta.items()},
-            choose(kept, self.h, other.h),
-            choose(kept, self.log_posterior, other.log_posterior),
-            choose(kept, self.bias, other.bias),
-            choose(kept, self.excess, other.excess),
-            choose(kept, self.candidate, other.candidate),
-            choose(kept, self.diverged, other.diverged),
-            self.adaptations,
-        )
+        theta = {name: choose(kept, value, other.theta[name]) for name, value in self.theta.items()}
+        rows: dict[str, Any] = {name: choose(kept, value, getattr(other, name)) for name, value in self._rows.items()}
+        return replace(self, theta=theta, **rows)
+
+    @property
+    def _rows(self) -> dict[str, Tensor]:
+        """The fields that have a row for each robot, but theta."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
 
 
 def prior(model: Dynamics, candidates: Candidates, robots: int) -> Belief:

@@ -87,7 +87,7 @@ def updated_bias(bias: Tensor, residual: Tensor, seen: Tensor) -> Tensor:
     Args:
         bias: Their mean before.
         residual: Of the newest transition.
-        seen: How many transitions there were, (B,).
+        seen: n, how many transitions the memory holds, the newest among them, (B,).
     """
     return torch.lerp(bias, residual, (1.0 / seen.clamp(1.0, _LASTING))[:, None, None, None])
 
@@ -107,12 +107,14 @@ def expected_square(posterior: Tensor, fresh: Tensor, noise: Tensor, degrees_of_
 
 
 def updated_excess(excess: Tensor, squared: Tensor, seen: Tensor) -> Tensor:
-    """Averages squared errors over what a robot has seen, the newest hundred above all, (B, obs_dim).
+    """Averages squared errors over what a robot has seen, the newest hundred at most, (B, obs_dim).
+
+    The memory bounds n too: a shorter one averages over fewer.
 
     Args:
         excess: Their mean before, (B, obs_dim).
         squared: Of the newest transition, (B, obs_dim).
-        seen: How many transitions there were, (B,).
+        seen: n, how many transitions the memory holds, the newest among them, (B,).
     """
     return torch.lerp(excess, squared, (1.0 / (_BELIEVED + seen.clamp(max=_REMEMBERED)))[:, None])
 

@@ -2,6 +2,9 @@
 
 :data:`_NAMES` says which keyword is which field of which part, :func:`parts_of` builds the parts that keywords
 describe, and :func:`keywords_of` is its inverse.
+
+A new setting is a field of a part, with a default and a line in its docstring, and an entry in :data:`_NAMES`. Where it
+applies, it has one in :data:`AT_LEAST_ONE`, :data:`CHOICES` and :data:`_NEEDS`. Files without it have the default.
 """
 
 from __future__ import annotations
