@@ -60,7 +60,7 @@ class Adapter(Protocol):
 class Controller:
     """Runs Algorithm 2.
 
-    The paper's lines are here::
+    The paper's lines are here:
 
         2     the most likely embedding, given D_M and theta_meta     adapter.judge, .infer and .adapt
         3     k gradient steps on theta and h from there              adapter.adapt

@@ -1,18 +1,18 @@
 """How likely each candidate is (line 2 of Algorithm 2): by the paper's window of transitions, or by a Bayesian filter.
 
-Errors are counted in the deviations that were fitted in simulation: r[t, p, c, d] is that of transition t in the
+Errors are counted in the deviations that were fitted in simulation: ``r[t, p, c, d]`` is that of transition t in the
 observed number d, as predicted by member p of the ensemble with theta_meta and candidate c
 (:meth:`~famle_agent.adaptation.candidates.Candidates.residuals`). p_nu is the standard Gaussian or Student-t, lambda is
 ``likelihood_power``, w_0 the prior, and n how many transitions the memory holds, t among them. Terms that are the same
 for all candidates are left out.
 
-The paper takes the likelihood of the newest W transitions (:func:`window_posterior`)::
+The paper takes the likelihood of the newest W transitions (:func:`window_posterior`):
 
     l[t, c]   = lambda mean_p sum_d log p_nu(r[t, p, c, d])
     log w[c]  = log w_0[c] + sum_t l[t, c]
 
 The filter takes from the errors what has lasted, b, and scales them by the robot's own noise, v. Then it predicts with
-the hazard eta, and corrects by the newest transition (:func:`filtered_posterior`)::
+the hazard eta, and corrects by the newest transition (:func:`filtered_posterior`):
 
     f[p, c, d] = r[t, p, c, d] - b[t-1, p, c, d]
     v[d]       = max(1, e[t-1, d])
@@ -20,14 +20,13 @@ the hazard eta, and corrects by the newest transition (:func:`filtered_posterior
     w[t, c]    ~ ((1 - eta) w[t-1, c] + eta w_0[c]) exp(l[c])
 
 What lasts (:func:`updated_bias`) and the mean square of the rest (:func:`expected_square`, :func:`updated_excess`) are
-averages over a robot's last transitions::
+averages over a robot's last transitions:
 
     b[t]  = b[t-1] + (r[t] - b[t-1]) / min(n, 10)
     q[d]  = sum_c w[t-1, c] mean_p u f[p, c, d]^2, where u = (nu + 1) / (nu + f[p, c, d]^2 / v[d]), or 1 for a Gaussian
     e[t]  = e[t-1] + (q - e[t-1]) / (10 + min(n, 100))
 
-At t = 0, w is w_0, b is 0 and e is 1. A step of this is
-:meth:`~famle_agent.adaptation.adapters.EmbeddingAdapter.infer`.
+At t = 0, w is w_0, b is 0 and e is 1. :meth:`~famle_agent.adaptation.adapters.EmbeddingAdapter.infer` takes the steps.
 """
 
 from __future__ import annotations

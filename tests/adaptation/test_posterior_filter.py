@@ -3,15 +3,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import stats
 
 from famle_agent import FAMLE
+from famle_agent.adaptation.adapters import EmbeddingAdapter
 from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.memory import Memory
 from famle_agent.adaptation.posterior import filtered_posterior
-from tests.helpers import run, simple_model
+from famle_agent.adaptation.settings import Adaptation, Filter
+from tests.helpers import random_transitions, run, simple_model
 
 hazards = st.floats(1e-6, 0.5)
 
@@ -23,6 +28,34 @@ def filtered(candidates: Candidates, log_p: torch.Tensor, hazard: float) -> torc
         log_posterior = filtered_posterior(candidates, log_posterior, row[None], hazard)
         history.append(log_posterior.exp()[0])
     return torch.stack(history)
+
+
+@pytest.mark.parametrize("nu", [0.0, 4.0])
+@torch.no_grad()
+def test_steps_of_the_filter_are_the_equations_of_its_docstring(nu: float) -> None:
+    model = simple_model(n_situations=3, members=2, degrees_of_freedom=nu)
+    model.noise_std.copy_(0.2 + torch.rand_like(model.noise_std))
+    eta, power, places = 0.01, 0.5, 20
+    adapter = EmbeddingAdapter(model, Adaptation(evidence=Filter(eta), compose=True, likelihood_power=power), seed=0)
+    belief, moved = adapter.initial(1), torch.ones(1, dtype=torch.bool)
+    w_0 = adapter.candidates.log_prior.double().exp().numpy()
+    memory = Memory.empty(1, places, model.obs_dim, model.action_dim, len(w_0), torch.device("cpu"), 10)
+    w, b, e = w_0, np.zeros((2, len(w_0), 3)), np.ones(3)
+    for t in range(30):
+        transition = [values[:, 0] for values in random_transitions(model, 1, 1)]
+        evidence = adapter.judge(belief, *transition)
+        memory = memory.add(*transition, evidence.log_p, evidence.own_log_p, moved)
+        belief = adapter.infer(memory, belief, evidence, moved)
+        r, n = evidence.residual[0].double().numpy(), min(t + 1, places)  # (P, C, obs_dim)
+        f, v = r - b, np.maximum(1.0, e)
+        log_density = stats.t(nu).logpdf if nu else stats.norm.logpdf
+        log_p = power * log_density(f / np.sqrt(v)).sum(axis=2).mean(axis=0)  # (C,)
+        u = (nu + 1) / (nu + f**2 / v) if nu else 1.0
+        q = (w[:, None] * (u * f**2).mean(axis=0)).sum(axis=0)  # (obs_dim,)
+        w = ((1 - eta) * w + eta * w_0) * np.exp(log_p - log_p.max())
+        w, b, e = w / w.sum(), b + (r - b) / min(n, 10), e + (q - e) / (10 + min(n, 100))
+        for found, expected in ((belief.posterior, w), (belief.bias, b), (belief.excess, e)):
+            np.testing.assert_allclose(found[0].numpy(), expected, rtol=1e-3, atol=1e-4)
 
 
 @given(hazards, st.booleans(), st.integers(0, 1000))
