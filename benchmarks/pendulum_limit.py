@@ -5,23 +5,36 @@ python -m benchmarks.pendulum_limit
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.ndimage import map_coordinates
 
 from benchmarks.gym_robots import BEDS
+from benchmarks.runner import launch
 
 STEPS, PERIOD, GRAVITY, TORQUE, SPEED = 200, 0.05, 10.0, 2.0, 8.0
 """Of Gymnasium's Pendulum-v1."""
 
 
-def best_return(mass: float, length: float, states: int = 201, torques: int = 11) -> float:
+@dataclass(frozen=True)
+class Args:
+    """The best that anybody can get from the pendulums of benchmarks.gym_robots."""
+
+    states: int = 201
+    """Angles, and speeds, of the grid."""
+    torques: int = 11
+    """Torques to choose from, evenly spaced."""
+
+
+def best_return(mass: float, length: float, states: int, torques: int) -> float:
     """Computes the largest return of 200 steps from rest below, by value iteration on a grid.
 
     Args:
         mass: In kg.
         length: In m.
-        states: Angles, and speeds, of the grid.
-        torques: Torques to choose from, evenly spaced.
+        states: See :class:`Args`.
+        torques: See :class:`Args`.
     """
     angle, speed = np.linspace(-np.pi, np.pi, states), np.linspace(-SPEED, SPEED, states)
     th, w, u = np.meshgrid(angle, speed, np.linspace(-TORQUE, TORQUE, torques), indexing="ij")  # (angle, speed, torque)
@@ -36,12 +49,13 @@ def best_return(mass: float, length: float, states: int = 201, torques: int = 11
     return -float(left[0, states // 2])
 
 
-def main() -> None:
+def main(args: Args) -> None:
     """Prints the largest return of each unseen pendulum."""
     for name, make in BEDS["pendulum"]().test.items():
         pendulum = make().unwrapped
-        print(f"{name}: {best_return(pendulum.m, pendulum.l):.0f}", flush=True)  # type: ignore[attr-defined]
+        best = best_return(pendulum.m, pendulum.l, args.states, args.torques)  # type: ignore[attr-defined]
+        print(f"{name}: {best:.0f}", flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    launch(main, Args)
