@@ -8,6 +8,10 @@ import pytest
 from benchmarks.ablations import PIECES, Args, main, robots, summary
 from benchmarks.results import load
 
+ROOT = Path(__file__).parents[2]
+QUOTED = {"reacher": 1, "ant": 0, "quadruped": 1, "minitaur": 1, "pusher": 1, "walker2d": 0}
+"""The columns of the manual's table, and their digits behind the point."""
+
 
 def test_pieces_are_compared_pair_by_pair() -> None:
     rows = [("all", 0, 3.0), ("all", 1, 5.0), ("frozen", 0, 1.0), ("frozen", 1, 2.0)]
@@ -15,6 +19,17 @@ def test_pieces_are_compared_pair_by_pair() -> None:
     assert list(found.index) == ["all", "frozen"]
     assert found.loc["frozen"].to_dict() == {"mean": 1.5, "median": 1.5, "less all": -2.5, "+-": 0.5}
     assert found.loc["all", "less all"] == 0.0
+
+
+def test_manual_quotes_the_stored_results() -> None:
+    manual = (ROOT / "docs" / "results.md").read_text().partition("## What each piece of adaptation is worth")[2]
+    rows = [line.split("|")[1:-1] for line in manual.partition("\n##")[0].splitlines() if line.startswith("|")]
+    for column, (robot, digits) in enumerate(QUOTED.items(), start=1):
+        found = summary(load(ROOT / "benchmarks" / "results" / f"ablations-{robot}.csv")).drop("all")
+        quoted = [row[column].strip() for row in rows[3:]]
+        assert quoted == [
+            f"{less:+,.{digits}f} +- {error:,.{digits}f}" for less, error in found[["less all", "+-"]].values
+        ]
 
 
 @pytest.mark.parametrize("robot", ["ant", "quadruped", "minitaur"])
