@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -83,8 +84,8 @@ def _other_each_time(folder: Path) -> str:
 
 @pytest.mark.slow
 def test_all_parts_are_tried_and_stored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    parts = tuple(part for part in PARTS if part not in ("interruptions", "files"))
-    main(Args(parts, steps=100, environments=15, learns=10, out=tmp_path))
+    parts = tuple(part for part in PARTS if part not in ("interruptions", "files", "learning"))
+    main(Args(parts, steps=100, environments=15, out=tmp_path))
     table = load(tmp_path / "robustness.csv")
     assert set(table["part"]) == set(parts)
     assert (table["wrong"] == 0).all()
@@ -93,8 +94,11 @@ def test_all_parts_are_tried_and_stored(tmp_path: Path, capsys: pytest.CaptureFi
 
 @pytest.mark.parametrize("part", [environments, pytest.param(learning, marks=pytest.mark.slow)])
 def test_robots_and_agents_are_let_go(part: Callable[[Args], Iterator[Row]]) -> None:
+    ignored = {"memory"}  # which takes longer to settle
+    if sys.gettrace() is not None:
+        ignored.add("objects")  # a measurement of coverage keeps some for each thread
     for row in part(Args(environments=16, learns=10)):
-        assert [line for line in row.wrong if "memory" not in line] == [], row.tried  # which takes longer to settle
+        assert [line for line in row.wrong if not any(name in line for name in ignored)] == [], row.tried
 
 
 LEAKS: dict[str, Callable[[list[Any]], Any]] = {
