@@ -23,7 +23,7 @@ from famle_agent.adaptation.posterior import (
     window_posterior,
 )
 from famle_agent.adaptation.settings import Adaptation, Filter
-from famle_agent.adaptation.update import descend, gradient_steps, select  # noqa: F401 - callers may have them from here
+from famle_agent.adaptation.update import gradient_steps, select
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.simulator import Simulator
 

@@ -9,13 +9,6 @@ import torch
 from torch import Tensor
 
 from famle_agent.adaptation.candidates import Candidates
-from famle_agent.adaptation.posterior import (  # noqa: F401 - callers may have them from here
-    filtered_posterior,
-    systematic_sample,
-    updated_bias,
-    updated_excess,
-    window_posterior,
-)
 from famle_agent.models.dynamics import Dynamics, Theta
 
 __all__ = ["Belief", "Evidence", "choose", "prior", "unadapted"]

@@ -30,7 +30,7 @@ def close_when_let_go(logger: Logger) -> Logger:
 
 def _close(formats: Sequence[KVWriter]) -> None:
     for output in formats:
-        with suppress(OSError):  # the folder may have been removed
+        with suppress(FileNotFoundError):  # its folder was removed, and what was in it with that
             output.close()
 
 
