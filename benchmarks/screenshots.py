@@ -59,7 +59,7 @@ def photograph(log: Path, out: Path, chromium: str) -> None:
     """Shows the runs in a folder in TensorBoard, and writes pictures of its pages.
 
     Raises:
-        CalledProcessError: The browser fails.
+        ChildProcessError: The browser fails; the message is its own.
     """
     out.mkdir(parents=True, exist_ok=True)
     board = TensorBoard()
@@ -71,7 +71,10 @@ def photograph(log: Path, out: Path, chromium: str) -> None:
             window = [f"--window-size={size[0]},{size[1]}", f"--force-device-scale-factor={scale}"]
             files = [f"--user-data-dir={profile}", f"--screenshot={shot}"]
             command = [chromium, *_OPTIONS, _PATIENCE, *window, *files, f"{url}?darkMode=false#{page}"]
-            subprocess.run(command, check=True, capture_output=True, timeout=300)
+            done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
+            if done.returncode or not shot.exists():
+                why = f"status {done.returncode}: {done.stderr}"
+                raise ChildProcessError(f"{chromium} made no picture of {title}, {why}")
             Image.open(shot).convert("RGB").quantize(64).save(new, "PNG", optimize=True)
 
 

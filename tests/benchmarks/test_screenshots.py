@@ -38,6 +38,17 @@ def test_pictures_are_of_the_pages_of_a_log(tmp_path: Path) -> None:
             assert picture.size == (len('["with_adaptation"]'), 7)
 
 
+@pytest.mark.slow
+def test_browser_that_fails_says_why_and_leaves_no_picture(tmp_path: Path) -> None:
+    browser = tmp_path / "browser"
+    browser.write_text(f"#!{sys.executable}\nraise SystemExit('no display')\n")
+    browser.chmod(0o755)
+    (tmp_path / "log").mkdir()
+    with pytest.raises(ChildProcessError, match=r"no picture of scalars, status 1: no display"):
+        photograph(tmp_path / "log", tmp_path / "out", str(browser))
+    assert not list((tmp_path / "out").glob("*.png"))
+
+
 def test_missing_browser_is_named_before_anything_runs(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"'no-browser'.*--chromium"):
         main(Args(tmp_path / "out", "no-browser"))
