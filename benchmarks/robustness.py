@@ -209,7 +209,9 @@ def environments(args: Args) -> Iterator[Row]:
         with suppress(MissingPackageError):
             once(env_id, engine, seed=0)  # which reads what is read but once, such as meshes
             kinds.append((env_id, engine))
-    yield repeated("make() and close()", args.environments, lambda i: once(*kinds[i % len(kinds)], seed=i))
+    row = repeated("make() and close()", args.environments, lambda i: once(*kinds[i % len(kinds)], seed=i))
+    row.figures["robots, in each engine that they can run in here"] = len(kinds)
+    yield row
 
 
 def learning(args: Args) -> Iterator[Row]:
