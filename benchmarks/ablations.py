@@ -22,7 +22,7 @@ import pandas as pd
 from benchmarks import gym_robots, minitaur, quadruped
 from benchmarks.methods import famle
 from benchmarks.results import Result, load
-from benchmarks.runner import Batch, Options, launch, run_batches
+from benchmarks.runner import Batch, Execution, launch, run_batches
 from benchmarks.task import Task
 from famle_agent import FAMLEWrapper, ModelBasedAgent
 from famle_agent.rollout import Rollout, rollout
@@ -118,7 +118,7 @@ def robots(cache: Path) -> Mapping[str, Robot]:
 
 
 @dataclass(frozen=True)
-class Args(Options):
+class Args(Execution):
     """What each piece of adaptation is worth."""
 
     robots: tuple[str, ...] = tuple(robots(Path()))

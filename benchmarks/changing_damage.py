@@ -26,7 +26,7 @@ import pandas as pd
 from benchmarks.gym_robots import agent_of
 from benchmarks.methods import famle
 from benchmarks.results import Result, load
-from benchmarks.runner import Batch, Options, launch, run_batches
+from benchmarks.runner import Batch, Execution, launch, run_batches
 from benchmarks.task import Task
 from famle_agent import FAMLEWrapper, ModelBasedAgent
 from famle_envs import Situation
@@ -80,7 +80,7 @@ BEDS: Mapping[str, Bed] = {
 
 
 @dataclass(frozen=True)
-class Args(Options):
+class Args(Execution):
     """Robots whose damage changes."""
 
     robots: tuple[str, ...] = tuple(BEDS)

@@ -22,7 +22,7 @@ import pandas as pd
 from benchmarks import gym_robots
 from benchmarks.methods import famle
 from benchmarks.results import Result, load
-from benchmarks.runner import Batch, Options, launch, run_batches
+from benchmarks.runner import Batch, Execution, launch, run_batches
 from benchmarks.task import Task
 from famle_agent import FAMLE, FAMLEWrapper
 from famle_agent.adaptation.diagnosis import STRANGE
@@ -49,7 +49,7 @@ OURS: Mapping[str, tuple[type[RobotEnv], Sequence[str], str]] = {
 
 
 @dataclass(frozen=True)
-class Args(Options):
+class Args(Execution):
     """What a diagnosis is worth."""
 
     robots: tuple[str, ...] = tuple(OURS)

@@ -25,7 +25,7 @@ import pandas as pd
 from benchmarks.methods import from_cache
 from benchmarks.model_free import MODEL_FREE, Policy, as_policy
 from benchmarks.results import Result, load
-from benchmarks.runner import Batch, Options, launch, run_batches
+from benchmarks.runner import Batch, Execution, launch, run_batches
 from famle_agent import AMPC, AMPCMAML, FAMLE, FAMLEWrapper, ModelBasedAgent
 from famle_agent.training.policy_search import PolicySearch
 from famle_envs.faults import FaultWrapper
@@ -163,7 +163,7 @@ LONG = ("sac-10x", "ppo-10x")
 
 
 @dataclass(frozen=True)
-class Args(Options):
+class Args(Execution):
     """Robots of Gymnasium with faults that nobody has seen."""
 
     beds: tuple[str, ...] = tuple(BEDS)
@@ -311,12 +311,12 @@ def run(method: str, name: str, seed: int, lives: int, cache: Path, change: tupl
 
 
 def summary(results: pd.DataFrame) -> pd.DataFrame:
-    """Takes median, worst and best over meta-trainings, unseen robots and lives, and the median of each robot."""
+    """Counts lives of unseen robots; takes median, worst and best over all, and the median of each robot."""
     table = pd.DataFrame(list(results["returns"]), index=results["method"])
     lives = table.melt(ignore_index=False, var_name="robot", value_name="return").explode("return")
     lives = lives.astype({"return": float})
     methods = [method for method in (*METHODS, *LONG) if method in table.index]
-    over_all = lives.groupby(level=0)["return"].agg(["median", "min", "max"])
+    over_all = lives.groupby(level=0)["return"].agg(["size", "median", "min", "max"]).rename(columns={"size": "lives"})
     of_each = lives.pivot_table("return", index="method", columns="robot", aggfunc="median")[table.columns]
     return over_all.join(of_each).loc[methods]
 

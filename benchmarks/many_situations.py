@@ -22,7 +22,7 @@ import torch
 
 from benchmarks.methods import from_cache
 from benchmarks.results import Result, load
-from benchmarks.runner import Batch, Options, launch, run_batches
+from benchmarks.runner import Batch, Execution, launch, run_batches
 from famle_agent import FAMLE, FAMLEWrapper, ModelBasedAgent
 from famle_envs import Situation
 from famle_envs.reacher import ReacherEnv
@@ -54,11 +54,13 @@ SETS: Mapping[str, Set] = {
 
 
 @dataclass(frozen=True)
-class Args(Options):
+class Args(Execution):
     """What more training situations are worth."""
 
     sets: tuple[str, ...] = tuple(SETS)
     """Entries of SETS."""
+    replicates: int = 10
+    """Test arms."""
 
 
 def drawn(split: int, n: int) -> list[Situation]:

@@ -32,13 +32,9 @@ class ReplicateError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Options:
-    """What all benchmarks can be told. Each runs replicates that are not stored yet, then reports on all that are."""
+class Execution:
+    """How replicates are run, and where results and agents are kept."""
 
-    methods: tuple[str, ...] = ()
-    """Entries of benchmarks.methods.METHODS; by default those of the experiment in reporting/experiments.yaml."""
-    replicates: int = 10
-    """Seeds 0, 1, ..."""
     jobs: int = 2
     """Batches of replicates that run at the same time."""
     backend: Backend = "loky"
@@ -47,6 +43,16 @@ class Options:
     """Folder of the results."""
     cache: Path = Path("runs/agents")
     """Folder of the agents that are learnt in simulation."""
+
+
+@dataclass(frozen=True)
+class Options(Execution):
+    """What benchmarks that compare methods can be told. Each runs what is not stored, then reports on all that is."""
+
+    methods: tuple[str, ...] = ()
+    """Entries of benchmarks.methods.METHODS; by default those of the experiment in reporting/experiments.yaml."""
+    replicates: int = 10
+    """Seeds 0, 1, ..."""
     in_step: int = 30
     """Replicates of one method that act in step at most, where its robots can do that; they are stored together."""
     device: str = "cpu"

@@ -57,7 +57,7 @@ def test_what_is_unknown_is_refused() -> None:
 def test_summary_is_over_meta_trainings_robots_and_lives() -> None:
     returns = [{"a": [1.0, 2.0], "b": [9.0, 4.0]}, {"a": [3.0, 3.0], "b": [8.0, 5.0]}]
     found = summary(pd.DataFrame({"method": ["famle", "famle"], "returns": returns})).loc["famle"]
-    assert found.to_dict() == {"median": 3.5, "min": 1.0, "max": 9.0, "a": 2.5, "b": 6.5}
+    assert found.to_dict() == {"lives": 8, "median": 3.5, "min": 1.0, "max": 9.0, "a": 2.5, "b": 6.5}
 
 
 def test_manual_quotes_the_stored_results() -> None:
