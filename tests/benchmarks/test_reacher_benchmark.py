@@ -21,7 +21,9 @@ def test_test_damages_are_unseen_and_differ_between_replicates() -> None:
 @pytest.mark.usefixtures("small_reacher")
 def test_reacher_benchmark_runs_methods_and_reports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     methods, budget = ("famle", "famle-frozen", "ampc", "ppo"), {"steps": 3 * EPISODE, "ppo_steps": 4 * EPISODE}
-    args = reacher.Args(methods, replicates=1, jobs=1, out=tmp_path / "results", cache=tmp_path / "cache", **budget)
+    args = reacher.Args(
+        methods=methods, replicates=1, jobs=1, out=tmp_path / "results", cache=tmp_path / "cache", **budget
+    )
     reacher.main(args)
     table = capsys.readouterr().out
     assert all(style_of(method).label in table for method in methods)

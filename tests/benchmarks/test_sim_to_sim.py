@@ -80,7 +80,15 @@ def test_replicates_take_turns_with_models_and_are_stored_summed_up_and_drawn(
     simulator: Engine, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     methods = ("famle", "famle-frozen", ORACLE)
-    args = Args(methods, 3, jobs=1, out=tmp_path, cache=tmp_path / "cache", robots=("reacher",), simulator=simulator)
+    args = Args(
+        methods=methods,
+        replicates=3,
+        jobs=1,
+        out=tmp_path,
+        cache=tmp_path / "cache",
+        robots=("reacher",),
+        simulator=simulator,
+    )
     args = replace(args, meta_trainings=2)
     main(args)
     shown, cache = capsys.readouterr().out, task_of("reacher", 0, args).cache
