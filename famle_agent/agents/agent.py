@@ -267,7 +267,7 @@ class ModelBasedAgent(MetaLearningAgent):
         if not self._custom_logger:
             close_when_let_go(self.logger)
         hooks.on_training_start(locals(), globals())
-        perception, online, watch = self.perception, self._online, VecWatch(env)
+        online, watch = self._online, VecWatch(env)
         state, self._calls = online.state_of(env.num_envs), watch.calls
         logger = Logger(None, []) if log_interval is None else self.logger
         with closing(AdaptationLog(self, logger, self.num_timesteps)) as log:
@@ -278,7 +278,7 @@ class ModelBasedAgent(MetaLearningAgent):
                 starts = self._flags(self._last_episode_starts)
                 readings = self._tensor(vec_readings(self._last_obs, env))
                 self._last_obs = None  # the next learn() resets, should this step fail
-                action, state = online.act(perception, state, readings, starts, self.generator)  # line 4
+                action, state = online.act(state, readings, starts, self.generator)  # line 4
                 try:
                     step, reset_alone = watch.step(to_action_space(action, self.action_space))
                 except BaseException:
@@ -286,7 +286,7 @@ class ModelBasedAgent(MetaLearningAgent):
                     raise
                 self.num_timesteps, self._calls = self.num_timesteps + env.num_envs, watch.calls
                 moved = self._flags(step.known & ~reset_alone)
-                state = online.learn(perception, state, self._tensor(step.reached), moved)  # lines 5, 6, then 2 and 3
+                state = online.learn(state, self._tensor(step.reached), moved)  # lines 5, 6, then 2 and 3
                 # By names that callbacks know.
                 new_obs, rewards, dones, infos = step.obs, step.rewards, step.dones, step.infos
                 self._last_obs, self._last_episode_starts = new_obs, dones | reset_alone
@@ -360,7 +360,7 @@ class ModelBasedAgent(MetaLearningAgent):
             SensorError: No robot has had an observation that can be a measurement for too long.
             ValueError: The observation has the wrong shape, or is of no numbers.
         """
-        perception, generator = self.perception, self.generator
+        _ = self.model  # refuses to act on nothing, whatever the observation is
         try:
             numbers = reading(observation, self.observation_space)
         except ValueError:
@@ -373,9 +373,8 @@ class ModelBasedAgent(MetaLearningAgent):
                 f"Got {len(readings)} observations, but {len(starts)} values of episode_start and a state of "
                 f"{len(readings) if state is None else state.robots} robots; they must be of the same robots."
             )
-        if deterministic:
-            generator = torch.Generator(self.device).manual_seed(self.seed or 0)
-        action, state = self._online.predict(perception, state, readings, starts, generator)
+        generator = torch.Generator(self.device).manual_seed(self.seed or 0) if deterministic else self.generator
+        action, state = self._online.predict(state, readings, starts, generator)
         actions = to_action_space(action, self.action_space)
         return (actions[0] if numbers.ndim == 1 else actions), state
 
@@ -394,12 +393,13 @@ class ModelBasedAgent(MetaLearningAgent):
             NotLearnedError: The agent has no model yet.
             ValueError: A shape is wrong, or the action is not finite.
         """
-        perception, s, s_next = self.perception, self._readings(obs), self._readings(next_obs)
+        _ = self.model  # refuses to learn with nothing, whatever the transition is
+        s, s_next = self._readings(obs), self._readings(next_obs)
         a = self._tensor(np.atleast_2d(check_action(action, self.action_space)))
         if not len(s) == len(a) == len(s_next):
             raise ValueError(f"Got {len(s)} observations, {len(a)} actions and {len(s_next)} next observations.")
         a = self.policy.builder.action_scale.to_unit(a).clamp(-1.0, 1.0)
-        self._online.observe(perception, s, a, s_next)
+        self._online.observe(s, a, s_next)
 
     @torch.inference_mode(mode=False)
     def locate(self, obs: Array | None, dropped: bool = False) -> None:
@@ -413,8 +413,7 @@ class ModelBasedAgent(MetaLearningAgent):
             NotLearnedError: The agent has no model yet.
             ValueError: The shape is wrong.
         """
-        readings = self._readings(obs)
-        self._online.locate(self.perception, readings, dropped)
+        self._online.locate(self._readings(obs), dropped)
 
     @torch.inference_mode(mode=False)
     def begin_episode(self) -> None:

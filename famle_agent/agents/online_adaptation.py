@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from famle_agent.adaptation.perception import Perception, senses_of
+from famle_agent.adaptation.perception import senses_of
 from famle_agent.adaptation.senses import Senses
 from famle_agent.adaptation.state import OnlineState
 from famle_agent.agents.policy import AdaptivePolicy
@@ -75,7 +75,6 @@ class OnlineAdaptation:
 
     def act(
         self,
-        perception: Perception,
         state: OnlineState,
         readings: Tensor,
         starts: Tensor,
@@ -85,7 +84,6 @@ class OnlineAdaptation:
         """Plans from where robots are (line 4), and counts what was late.
 
         Args:
-            perception: Algorithm 2, on robots whose sensors may fail.
             state: What is believed of the robots.
             readings: What their sensors say, (B, obs_dim).
             starts: Which of them were just reset, (B,).
@@ -98,7 +96,8 @@ class OnlineAdaptation:
         Raises:
             SensorError: No robot can plan.
         """
-        deadline, state = deadline or self._deadline(), perception.begin(state, readings, starts)
+        deadline, perception = deadline or self._deadline(), self._policy.perception
+        state = perception.begin(state, readings, starts)
         start = time.perf_counter()
         planned = perception.act(state, starts, generator, deadline)
         self._plan_ms = 1e3 * (time.perf_counter() - start)
@@ -107,11 +106,10 @@ class OnlineAdaptation:
             self.cut_short += deadline.cut_short
         return planned
 
-    def learn(self, perception: Perception, state: OnlineState, readings: Tensor, moved: Tensor) -> OnlineState:
+    def learn(self, state: OnlineState, readings: Tensor, moved: Tensor) -> OnlineState:
         """Learns from where the last action led (lines 5 and 6), and adapts every K steps (lines 2 and 3).
 
         Args:
-            perception: Algorithm 2, on robots whose sensors may fail.
             state: The state after the last action.
             readings: What the sensors say, (B, obs_dim).
             moved: Whose step counts, (B,); those of the other robots are counted as dropped.
@@ -119,7 +117,7 @@ class OnlineAdaptation:
         Returns:
             What is believed since then.
         """
-        state = self._learnt_from(perception, state, readings, moved)
+        state = self._learnt_from(state, readings, moved)
         self._warn_of(state)
         return state
 
@@ -131,12 +129,7 @@ class OnlineAdaptation:
     # --- somebody else's loop ---------------------------------------------------------------------------
 
     def predict(
-        self,
-        perception: Perception,
-        state: OnlineState | None,
-        readings: Tensor,
-        starts: Tensor,
-        generator: torch.Generator,
+        self, state: OnlineState | None, readings: Tensor, starts: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, OnlineState]:
         """Plans with a state that the caller holds, after learning from the step that ends here.
 
@@ -146,11 +139,11 @@ class OnlineAdaptation:
         if given is None:
             state = self.state_of(len(readings))
         elif given is self._refused:  # what has come since its last action is no single step
-            state = perception.begin(replace(given, last=None), readings, torch.ones_like(starts))
+            state = self._policy.perception.begin(replace(given, last=None), readings, torch.ones_like(starts))
         else:
-            state = self._caught_up(perception, given, readings, starts)
+            state = self._caught_up(given, readings, starts)
         try:
-            action, state = self.act(perception, state, readings, starts, generator, deadline)
+            action, state = self.act(state, readings, starts, generator, deadline)
         except SensorError:
             self.refuse(given)
             raise
@@ -163,18 +156,18 @@ class OnlineAdaptation:
         """Notes that an observation was refused: the next one is not one step behind the last one of that state."""
         self._refused = state
 
-    def observe(self, perception: Perception, obs: Tensor, action: Tensor, next_obs: Tensor) -> None:
+    def observe(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> None:
         """Learns from a transition, (B, dim) each."""
         everyone = torch.ones(len(obs), dtype=torch.bool, device=obs.device)
-        state = perception.begin(self.state_of(len(obs)), obs, ~everyone)
+        state = self._policy.perception.begin(self.state_of(len(obs)), obs, ~everyone)
         state = replace(state, last=(senses_of(state).obs, action))
-        self._warn_of(self._learnt_from(perception, state, next_obs, everyone))
+        self._warn_of(self._learnt_from(state, next_obs, everyone))
         self._told = self.newest
 
-    def locate(self, perception: Perception, readings: Tensor, dropped: bool) -> None:
+    def locate(self, readings: Tensor, dropped: bool) -> None:
         """Notes where robots are, where nobody knows how they got there; counts a step where one was ``dropped``."""
         everyone = torch.ones(len(readings), dtype=torch.bool, device=readings.device)
-        state = perception.begin(self.state_of(len(readings)), readings, everyone)
+        state = self._policy.perception.begin(self.state_of(len(readings)), readings, everyone)
         self._senses = senses_of(state).dropping(everyone & dropped)
 
     def begin_episode(self) -> None:
@@ -227,8 +220,9 @@ class OnlineAdaptation:
         budget = self._policy.config.safety.step_budget_ms
         return None if budget is None else Deadline(budget, self._policy.device)
 
-    def _learnt_from(self, perception: Perception, state: OnlineState, readings: Tensor, moved: Tensor) -> OnlineState:
+    def _learnt_from(self, state: OnlineState, readings: Tensor, moved: Tensor) -> OnlineState:
         """Learns from a step that ends here, and notes what became of it; arguments as of :meth:`learn`."""
+        perception = self._policy.perception
         before, transitions = perception.sense(state, readings, moved)
         before = replace(before, senses=senses_of(before).dropping(~moved))
         self.newest = self._told = None  # frees the memories of the last step before others are made
@@ -239,10 +233,11 @@ class OnlineAdaptation:
         self.state, self._senses = after, after.senses
         return after
 
-    def _caught_up(self, perception: Perception, state: OnlineState, readings: Tensor, starts: Tensor) -> OnlineState:
+    def _caught_up(self, state: OnlineState, readings: Tensor, starts: Tensor) -> OnlineState:
         """Adds the step that ends here to a state, unless :meth:`observe` was told of it."""
         if state.last is None:
             return state
+        perception = self._policy.perception
         sensed, transitions = perception.sense(state, readings, ~starts)
         if self.state is not None and self._told is not None and _same_step(self._told.before, sensed, ~starts):
             return replace(self.state, plan=state.plan, last=None, senses=self._senses)
