@@ -323,7 +323,7 @@ class ModelBasedAgent(MetaLearningAgent):
     @torch.inference_mode(mode=False)
     def predict(  # type: ignore[override]
         self,
-        observation: Array | dict[str, Array],
+        observation: Array | None,
         state: OnlineState | None = None,
         episode_start: npt.NDArray[np.bool_] | None = None,
         deterministic: bool = False,
