@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks import curves
 from benchmarks.ant_informed import informed
-from benchmarks.methods import METHODS, PPO_METHODS, Method, about, famle, from_cache, model_based
+from benchmarks.methods import METHODS, PPO_METHODS, Method, about, famle, from_cache, model_based, on_its_way
 from benchmarks.results import Result
 from benchmarks.runner import Options, launch, run_experiment
 from benchmarks.task import Task
@@ -116,7 +116,7 @@ def without_embeddings(task: Task) -> FAMLE:
     agent = FAMLE(task.simulated(), seed=0, device="cpu", pretrained=False, compose=False, **budget)
     path = task.cache / "ant-without-embeddings.zip"
     mixed = [lambda: RandomSituation(task.simulated())]
-    return from_cache(agent, path, lambda agent: agent.meta_learn(mixed, folder=path.with_suffix("")))
+    return from_cache(agent, path, lambda agent: agent.meta_learn(mixed, folder=on_its_way(path)))
 
 
 def _in_step(tasks: Sequence[Task], **overrides: Any) -> FAMLE:

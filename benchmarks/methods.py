@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from filelock import FileLock
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from benchmarks import ppo
@@ -90,29 +91,32 @@ def about(agent: BaseAlgorithm, robot: int = 0) -> dict[str, Any]:
 def from_cache(agent: Agent, path: Path, learn: Callable[[Agent], object] = lambda agent: agent.meta_learn()) -> Agent:
     """Gives an agent the model in a file, where that was learnt as this agent would; else it learns one and saves it.
 
-    How it adapts and plans is the agent's own: a model outlasts a change of these settings.
+    How it adapts and plans is the agent's own: a model outlasts a change of these settings. Of replicates that want it
+    at the same time one learns, and the others wait. Learning may keep its progress in the folder :func:`on_its_way`.
     """
-    if path.exists():
-        agent.take_model(path)
-    if agent.dynamics is None:
-        learn(agent)
-        agent.save(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(f"{path}.lock"):
+        if path.exists():
+            agent.take_model(path)
+        if agent.dynamics is None:
+            learn(agent)
+            agent.save(path)
+            shutil.rmtree(on_its_way(path), ignore_errors=True)
     return agent
 
 
-def famle(task: Task, **overrides: Any) -> FAMLE:
-    """Makes FAMLE with the model that the package ships, or where it ships none one that is learnt in the cache.
+def on_its_way(path: Path) -> Path:
+    """Returns the folder beside a cached file from which learning that is stopped goes on, if it is asked for again."""
+    return path.with_suffix("")
 
-    Learning that is stopped goes on from a folder beside the cached file, if it is asked for again.
-    """
+
+def famle(task: Task, **overrides: Any) -> FAMLE:
+    """Makes FAMLE with the model that the package ships, or where it ships none one that is learnt in the cache."""
     if task.is_shipped:
         return shipped(task, **overrides)
     agent = FAMLE(task.simulated(), seed=task.meta_seed, device=task.device, pretrained=False, **overrides)
     path = task.cache / f"{task.robot}-ours-{task.meta_seed}.zip"
-    on_its_way = path.with_suffix("")
-    agent = from_cache(agent, path, lambda agent: agent.meta_learn(folder=on_its_way))
-    shutil.rmtree(on_its_way, ignore_errors=True)
-    return agent
+    return from_cache(agent, path, lambda agent: agent.meta_learn(folder=on_its_way(path)))
 
 
 def shipped(task: Task, **overrides: Any) -> FAMLE:
@@ -204,17 +208,11 @@ class MetaTrained:
         return agent
 
     def learn(self, task: Task) -> ModelBasedAgent:
-        """Learns the networks of all replicates, or takes them from the cache.
-
-        Learning that is stopped goes on from a folder beside the cached file, if it is asked for again.
-        """
+        """Learns the networks of all replicates, or takes them from the cache."""
         members = {} if task.is_shipped else {"members": self.networks}
         agent = self._new(replace(task, seed=0, device="cpu"), **self.simulation, **members)
         path = task.cache / f"{task.robot}-{self.name}.zip"
-        on_its_way = path.with_suffix("")
-        agent = from_cache(agent, path, partial(self._learn, task=task, folder=on_its_way))
-        shutil.rmtree(on_its_way, ignore_errors=True)
-        return agent
+        return from_cache(agent, path, partial(self._learn, task=task, folder=on_its_way(path)))
 
     def _learn(self, agent: ModelBasedAgent, task: Task, folder: Path) -> None:
         data = simulated_data(task) if self.mode == "ours" else None

@@ -20,7 +20,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from benchmarks import ant, quadruped, reacher
-from benchmarks.methods import METHODS, famle
+from benchmarks.methods import METHODS
 from benchmarks.reporting.pictures import draw_scores
 from benchmarks.reporting.registry import experiment_named, in_order, style_of
 from benchmarks.reporting.statistics import gap_closed, interquartile_mean
@@ -186,9 +186,6 @@ def main(args: Args) -> None:
     for robot in args.robots:
         tasks = [task_of(robot, seed, args) for seed in range(args.replicates)]
         table = path_of(robot, args.simulator, args.out)
-        if not tasks[0].is_shipped:
-            for task in tasks[: args.meta_trainings]:
-                famle(task)  # which replicates that run at the same time would each learn
         compare(args.methods, tasks, run, table, args, KNOWN)
         found = summary(robot, load(table)).rename(index=lambda method: style_of(method).label)
         bed, where = BEDS[robot], NAMES[OTHER[args.simulator]]

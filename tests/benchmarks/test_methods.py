@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from benchmarks import curves, methods
 from benchmarks.ant import ANT_METHODS
-from benchmarks.methods import META_TRAINED, METHODS, ORIGINAL_CANDIDATES, PPO_METHODS, MetaTrained, about
+from benchmarks.methods import META_TRAINED, METHODS, ORIGINAL_CANDIDATES, PPO_METHODS, MetaTrained, about, from_cache
 from benchmarks.reporting.registry import EXPERIMENTS, experiment_named
 from benchmarks.task import Task
 from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent, Transitions
@@ -228,7 +230,32 @@ def test_stopped_meta_training_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path
         recipe.learn(task)
     assert torch.equal(network_of(recipe.learn(task)), network_of(whole))
     assert len(iterations) == 3  # the first is not done again
-    assert [path.name for path in task.cache.iterdir()] == ["reacher-paper.zip"]
+    assert {path.name for path in task.cache.iterdir()} == {"reacher-paper.zip", "reacher-paper.zip.lock"}
+
+
+def test_of_replicates_at_the_same_time_one_learns(tmp_path: Path) -> None:
+    learnt: list[Any] = []
+
+    class Replicate:
+        dynamics: str | None = None
+
+        def take_model(self, path: Path) -> None:
+            self.dynamics = path.read_text()
+
+        def save(self, path: Path) -> None:
+            path.write_text("what was learnt")
+
+    def learn(agent: Any) -> None:
+        learnt.append(agent)
+        time.sleep(0.2)
+
+    def run(agent: Any) -> Any:
+        return from_cache(agent, tmp_path / "cache" / "one.zip", learn)
+
+    with ThreadPoolExecutor(3) as pool:
+        agents = list(pool.map(run, [Replicate() for _ in range(3)]))
+    assert [agent.dynamics for agent in agents if agent is not learnt[0]] == ["what was learnt"] * 2
+    assert len(learnt) == 1
 
 
 def test_replicates_share_one_network_where_one_is_shipped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
