@@ -73,16 +73,34 @@ def known_robots() -> dict[str, Robot]:
     entries = {name: yaml.safe_load(folder.joinpath(f"{name}.yaml").read_text()) for name in names}
     any_robot = entries["default"]
     robots = {}
-    for name, own in entries.items():
+    for name in entries:
         # A file says only what differs: from a robot that it is like, section by section; of how any robot adapts, of
         # the paper's settings, of the paper's for this one.
-        entry = entries[own["like"]] | own if "like" in own else own
+        entry = whole_entry(entries, name)
         ours, paper = (any_robot[of_any] | entry[mode] for of_any, mode in (("adaptation", "ours"), ("paper", "paper")))
         modes = {"ours": ours, "paper": paper}
         if "original" in entry:
             modes["original"] = modes["paper"] | entry["original"]
         robots[name] = Robot(name, entry["env_id"], modes, entry["rivals"])
     return robots
+
+
+def whole_entry(entries: Mapping[str, Mapping[str, Any]], name: str, *followed: str) -> Mapping[str, Any]:
+    """Fills in what a file leaves to the robot that it is ``like``, and that one to the next.
+
+    Args:
+        entries: The files' sections by the names of the robots.
+        name: Of the robot.
+        *followed: Robots that are like this one.
+
+    Raises:
+        ValueError: A robot is like itself in the end, or like one that there is none of.
+    """
+    if name in followed or name not in entries:
+        way = " is like ".join((*followed, name))
+        raise ValueError(f"A robot's settings must come to an end: {way}. Name another robot with `like`, or none.")
+    own = entries[name]
+    return {**whole_entry(entries, own["like"], *followed, name), **own} if "like" in own else own
 
 
 def robot_of(env_id: str | None) -> Robot:
