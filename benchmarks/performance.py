@@ -40,7 +40,7 @@ from famle_agent.adaptation.state import OnlineState
 from famle_agent.agents.presets import known_robots
 from famle_agent.agents.world_model import WorldModel
 from famle_agent.data.collect import collect
-from famle_agent.data.policies import MakePolicy, Policy, make_held_uniform
+from famle_agent.data.policies import MakeBatchPolicy, MakePolicy, Policy, make_held_uniform
 from famle_agent.models.dynamics import Batch
 from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.training.reptile import Reptile
@@ -196,7 +196,7 @@ def collection(robot: str, args: Args) -> dict[str, float]:
     names = [f"situation {i}" for i in range(len(sources))]
     plans, chance = agent.planning_policy(), make_held_uniform(agent.config.simulation.action_hold)
     envs = [source() if callable(source) else source for source in sources]
-    kinds: dict[str, tuple[MakePolicy, int]] = {
+    kinds: dict[str, tuple[MakePolicy | MakeBatchPolicy, int]] = {
         "by chance": (chance, args.transitions),
         "planned": (plans, max(2, args.transitions // 50)),
         "planned one by one": (_one_by_one(plans), max(2, args.transitions // 50)),
@@ -391,11 +391,12 @@ def _agent(robot: str, mode: str = "ours", situations: int = _SITUATIONS, **sett
     return agent
 
 
-def _one_by_one(plans: MakePolicy) -> MakePolicy:
-    """Hides that a policy could act for several situations at once."""
+def _one_by_one(plans: MakeBatchPolicy) -> MakePolicy:
+    """Has a policy of several situations act for one at a time."""
 
     def make(env: gym.Env[Any, Any], situation: int, rng: np.random.Generator) -> Policy:
-        return plans(env, situation, rng)
+        policy = plans([env], [situation], rng)
+        return lambda obs, episode_start: policy(obs[None], np.array([episode_start]))[0]
 
     return make
 

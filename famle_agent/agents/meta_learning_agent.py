@@ -24,7 +24,7 @@ from famle_agent.agents.tensorboard import log_embeddings
 from famle_agent.data.description import first_env
 from famle_agent.data.envs import SituationEnvs, SituationsLike, situation_envs
 from famle_agent.data.identity import identity
-from famle_agent.data.policies import MakePolicy
+from famle_agent.data.policies import MakeBatchPolicy
 from famle_agent.data.transitions import Transitions, check_names
 from famle_agent.training.run_folder import RunFolder
 
@@ -153,8 +153,8 @@ class MetaLearningAgent(StoredAgent):
         """Makes or takes one environment per training situation; arguments and errors as of :meth:`meta_learn`."""
         return situation_envs(self._require_env(), envs, self.config.simulation.episode_length)
 
-    def planning_policy(self) -> MakePolicy:
-        """Makes a policy that plans with what the agent has meta-learned, and knows which situation it is in."""
+    def planning_policy(self) -> MakeBatchPolicy:
+        """Returns what makes policies that plan with what was meta-learned, and know which situations they are in."""
         return planning_policy(self.policy)
 
     def _fingerprint(self, source: SituationEnvs | Transitions) -> dict[str, Any]:

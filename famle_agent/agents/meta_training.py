@@ -24,7 +24,7 @@ from famle_agent.agents.policy import AdaptivePolicy
 from famle_agent.agents.world_model import WorldModel
 from famle_agent.data.collect import collect
 from famle_agent.data.envs import SituationEnvs
-from famle_agent.data.policies import MakePolicy, make_held_uniform, make_planning, reward_names
+from famle_agent.data.policies import MakeBatchPolicy, MakePolicy, make_held_uniform, make_planning, reward_names
 from famle_agent.data.transitions import Transitions
 from famle_agent.models.actor_critic import ActorCritic
 from famle_agent.models.dynamics import Batch, Dynamics
@@ -177,13 +177,15 @@ def simulate(
         callback: Is told how many steps have been simulated since it was last told.
     """
     how = agent.policy.config.simulation
-    make_policy: MakePolicy = planning_policy(agent.policy) if number else make_held_uniform(how.action_hold)
+    make_policy: MakePolicy | MakeBatchPolicy = make_held_uniform(how.action_hold)
+    if number:
+        make_policy = planning_policy(agent.policy)
     seed = agent.draw_seed()
     n = how.transitions(number)
     return collect(envs.sources, envs.situations, n, make_policy, seed, callback, n_jobs, folder, how.episode_length)
 
 
-def planning_policy(policy: AdaptivePolicy) -> MakePolicy:
+def planning_policy(policy: AdaptivePolicy) -> MakeBatchPolicy:
     """Makes a policy for simulation that plans with what was learnt so far, and knows which situation it is in.
 
     Raises:

@@ -91,7 +91,7 @@ class _OneByOne:
     make_policy: MakePolicy
     batch_size: int = 1
 
-    def batched(
+    def __call__(
         self, envs: Sequence[gym.Env[Any, Any]], situations: Sequence[int], rng: np.random.Generator
     ) -> BatchPolicy:
         policy = self.make_policy(envs[0], situations[0], rng)
@@ -156,7 +156,7 @@ class _Task:
         with ExitStack() as stack:
             envs = [stack.enter_context(opened(robot.source, robot.situation)) for robot in self.robots]
             rng = np.random.default_rng(self.robots[0].sequence)
-            policy = self.maker.batched(envs, [robot.index for robot in self.robots], rng)
+            policy = self.maker(envs, [robot.index for robot in self.robots], rng)
             rollouts = [_Rollout(env, robot, self.episode_length) for env, robot in zip(envs, self.robots, strict=True)]
             for _ in range(self.n):
                 obs = np.stack([rollout.obs for rollout in rollouts])  # (B, obs_dim)

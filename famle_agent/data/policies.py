@@ -91,7 +91,7 @@ class MakeBatchPolicy(Protocol):
     def batch_size(self) -> int:
         """How many situations at most."""
 
-    def batched(
+    def __call__(
         self, envs: Sequence[gym.Env[Any, Any]], situations: Sequence[int], rng: np.random.Generator
     ) -> BatchPolicy:
         """Makes the policy of environments with the same spaces, given the index of each one's situation."""
@@ -149,17 +149,6 @@ class PlanningPolicy:
 
 
 @dataclass(frozen=True)
-class _Single:
-    """The policy of a batch of one."""
-
-    policy: BatchPolicy
-
-    def __call__(self, obs: Array, episode_start: bool) -> Array:
-        action: Array = self.policy(obs[None], np.array([episode_start]))[0]
-        return action
-
-
-@dataclass(frozen=True)
 class make_held_uniform:  # noqa: N801 (a function with arguments bound, which can be pickled)
     """Makes a :class:`HeldUniformPolicy`.
 
@@ -176,7 +165,7 @@ class make_held_uniform:  # noqa: N801 (a function with arguments bound, which c
 
 @dataclass(frozen=True)
 class make_planning:  # noqa: N801
-    """Makes a :class:`PlanningPolicy` that knows which situation it is in.
+    """Makes a :class:`PlanningPolicy` of robots that are simulated side by side, which knows their situations.
 
     Attributes:
         model: On the CPU.
@@ -197,12 +186,8 @@ class make_planning:  # noqa: N801
         """As many situations as keep a processor busy; no more, so that others are left for other processes."""
         return max(1, _CANDIDATES_AT_ONCE // (self.model.members * self.planner.candidates))
 
-    def __call__(self, env: gym.Env[Any, Any], situation: int, rng: np.random.Generator) -> Policy:
-        """See :data:`MakePolicy`."""
-        return _Single(self.batched([env], [situation], rng))
-
     @torch.no_grad()
-    def batched(
+    def __call__(
         self, envs: Sequence[gym.Env[Any, Any]], situations: Sequence[int], rng: np.random.Generator
     ) -> PlanningPolicy:
         """See :class:`MakeBatchPolicy`."""

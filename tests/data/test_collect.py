@@ -194,7 +194,7 @@ class InOrder:
 
     batch_size: int = 2
 
-    def batched(self, envs: Sequence[Any], situations: Sequence[int], rng: np.random.Generator) -> Any:
+    def __call__(self, envs: Sequence[Any], situations: Sequence[int], rng: np.random.Generator) -> Any:
         def act(obs: Array, begins: Array) -> Array:
             assert len(obs) == len(begins) == len(situations) <= self.batch_size
             assert (begins == (obs[:, 1] == 0)).all()  # of each robot's own episode

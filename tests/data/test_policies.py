@@ -12,7 +12,14 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from famle_agent.data.policies import HeldUniformPolicy, PlanningPolicy, make_held_uniform, make_planning
+from famle_agent.data.policies import (
+    HeldUniformPolicy,
+    MakeBatchPolicy,
+    PlanningPolicy,
+    Policy,
+    make_held_uniform,
+    make_planning,
+)
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.simulator import Simulator
 from famle_agent.planning import ICEM, MPPI, RandomShooting
@@ -66,9 +73,14 @@ def plane_model(members: int = 1) -> Dynamics:
     return model
 
 
-def policy_of(situation: int, planner: Any, env: Plane, reward_fn: Any = None, members: int = 1) -> PlanningPolicy:
-    make = make_planning(plane_model(members), planner, reward_fn)
-    return make(env, situation, np.random.default_rng(0))  # type: ignore[return-value]
+def alone(make: MakeBatchPolicy, env: Plane, situation: int = 0, seed: int = 0) -> Policy:
+    """The policy of one robot."""
+    policy = make([env], [situation], np.random.default_rng(seed))
+    return lambda obs, episode_start: policy(obs[None], np.array([episode_start]))[0]
+
+
+def policy_of(situation: int, planner: Any, env: Plane, reward_fn: Any = None, members: int = 1) -> Policy:
+    return alone(make_planning(plane_model(members), planner, reward_fn), env, situation)
 
 
 def unit(action: Array) -> Array:
@@ -133,30 +145,35 @@ def test_members_plan_together() -> None:
         model.embeddings[1, 0] = -2.0  # the other member believes that the robot moves the other way
         model.theta["weight_1"][1] *= 3.0
         model.theta["bias_1"][1] *= 3.0
-    policy = make_planning(model, PLANNERS[0], None)(Plane(goal=(3.0, -3.0)), 0, np.random.default_rng(0))
+    policy = alone(make_planning(model, PLANNERS[0], None), Plane(goal=(3.0, -3.0)))
     assert unit(policy(obs, True))[0] < -0.5
 
 
 def test_chance_comes_from_the_generator_alone() -> None:
     make, obs, env = make_planning(plane_model(), PLANNERS[0], None), np.zeros(2, np.float32), Plane((0.3, -0.2))
     state = torch.get_rng_state()
-    one, same, other = (make(env, 0, np.random.default_rng(seed))(obs, True) for seed in (0, 0, 1))
+    one, same, other = (alone(make, env, seed=seed)(obs, True) for seed in (0, 0, 1))
     np.testing.assert_array_equal(one, same)
     assert not np.array_equal(one, other)
     assert torch.equal(torch.get_rng_state(), state)
 
 
-@pytest.mark.parametrize("make", [make_held_uniform(3), make_planning(plane_model(), PLANNERS[0], None)])
-def test_what_makes_a_policy_can_be_sent_to_a_process(make: Any) -> None:
+@pytest.mark.parametrize(
+    ("make", "env", "situation", "obs"),
+    [
+        (make_held_uniform(3), Plane(), 1, np.ones(2, np.float32)),
+        (make_planning(plane_model(), PLANNERS[0], None), [Plane()], [1], np.ones((1, 2), np.float32)),
+    ],
+)
+def test_what_makes_a_policy_can_be_sent_to_a_process(make: Any, env: Any, situation: Any, obs: Array) -> None:
     sent = pickle.loads(pickle.dumps(make))  # noqa: S301 (our own)
-    env, obs = Plane(), np.ones(2, np.float32)
-    one, other = (each(env, 1, np.random.default_rng(5))(obs, True) for each in (make, sent))
+    one, other = (each(env, situation, np.random.default_rng(5))(obs, np.array([True])) for each in (make, sent))
     np.testing.assert_array_equal(one, other)
 
 
 def test_planning_leaves_the_model_as_it_is() -> None:
     model, before = plane_model(), plane_model()
-    make_planning(model, PLANNERS[0], None)(Plane(), 0, np.random.default_rng(0))(np.zeros(2, np.float32), True)
+    alone(make_planning(model, PLANNERS[0], None), Plane())(np.zeros(2, np.float32), True)
     for name, value in model.state_dict().items():
         assert torch.equal(value, before.state_dict()[name])
 
@@ -182,7 +199,7 @@ def test_planned_action_lies_in_the_action_space(low: float, high: float) -> Non
 def test_robots_plan_together_each_for_its_situation_and_its_own_goal(planner: Any) -> None:
     goals = [(3.0, -3.0), (3.0, -3.0), (-3.0, 3.0), (-3.0, -3.0)]
     make = make_planning(plane_model(members=2), planner, None)
-    policy = make.batched([Plane(goal) for goal in goals], [0, 1, 0, 1], np.random.default_rng(0))
+    policy = make([Plane(goal) for goal in goals], [0, 1, 0, 1], np.random.default_rng(0))
     actions = policy(np.zeros((4, 2), np.float32), np.ones(4, dtype=bool))
     assert actions.dtype == np.float32
     signs = np.array([[1.0, -1.0], [-1.0, 1.0], [-1.0, 1.0], [1.0, 1.0]])
@@ -197,7 +214,7 @@ def test_episode_that_begins_voids_the_plan_of_its_own_robot_alone() -> None:
 
     starts: list[Tensor] = []
     make = make_planning(plane_model(), Recorder(4, candidates=20, iterations=2), None)
-    policy = make.batched([Plane((3.0, 3.0)), Plane((-3.0, 3.0))], [0, 0], np.random.default_rng(0))
+    policy = make([Plane((3.0, 3.0)), Plane((-3.0, 3.0))], [0, 0], np.random.default_rng(0))
     for begins in ([True, True], [False, True]):
         policy(np.zeros((2, 2), np.float32), np.array(begins))
     assert starts[0].abs().max() == 0
@@ -215,7 +232,7 @@ def test_rewards_of_robots_may_be_numbers_and_numpy_arrays() -> None:
             return super().reward_fn(obs, action, next_obs).numpy()
 
     make = make_planning(plane_model(), PLANNERS[0], None)
-    policy = make.batched([Odd(), Numpy((3.0, -3.0))], [0, 0], np.random.default_rng(0))
+    policy = make([Odd(), Numpy((3.0, -3.0))], [0, 0], np.random.default_rng(0))
     action = unit(policy(np.zeros((2, 2), np.float32), np.ones(2, dtype=bool))[1])
     assert action[0] > 0.5
     assert action[1] < -0.5

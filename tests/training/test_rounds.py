@@ -204,7 +204,7 @@ def test_reward_that_is_learned_judges_the_plans_of_a_round() -> None:
     )
     agent = FAMLE("Pendulum-v1", device="cpu", seed=0, **settings)
     agent.meta_learn([lambda g=g: gym.make("Pendulum-v1", g=g) for g in (3.0, 10.0)])
-    policy = agent.planning_policy()(agent.get_env().envs[0], 0, np.random.default_rng(0))
+    policy = agent.planning_policy()(agent.get_env().envs, [0], np.random.default_rng(0))
     seen: list[torch.Tensor] = []
     original = type(agent.policy.world.reward).forward
 
@@ -214,7 +214,7 @@ def test_reward_that_is_learned_judges_the_plans_of_a_round() -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(type(agent.policy.world.reward), "forward", forward)
-        action = policy(np.array([1.0, 0.0, 0.0], np.float32), True)
+        (action,) = policy(np.array([[1.0, 0.0, 0.0]], np.float32), np.array([True]))
     assert seen
     assert 0.9 < torch.cat([value.flatten() for value in seen]).abs().max() <= 1.0 + 1e-6
     assert agent.action_space.contains(action)
