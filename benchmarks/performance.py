@@ -23,24 +23,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pandas as pd
 import torch
 from stable_baselines3.common.logger import Logger, configure
-from torch import Tensor
 
 from benchmarks.raw_cost import OneByOne, bare_products
 from benchmarks.results import provenance, store
 from benchmarks.runner import launch
 from benchmarks.stopwatch import growth_of, machine, medians, repeat
-from benchmarks.task import Task
-from famle_agent import FAMLE, AdaptationLog, FAMLEWrapper, ModelBasedAgent
-from famle_agent.adaptation.state import OnlineState
-from famle_agent.agents.presets import known_robots
-from famle_agent.agents.world_model import WorldModel
+from benchmarks.untrained import SITUATIONS, agent_of, experienced, one_by_one, robot_of, taking_in
+from famle_agent import AdaptationLog, FAMLEWrapper, ModelBasedAgent
 from famle_agent.data.collect import collect
-from famle_agent.data.policies import MakeBatchPolicy, MakePolicy, Policy, make_held_uniform
+from famle_agent.data.policies import MakeBatchPolicy, MakePolicy, make_held_uniform
 from famle_agent.models.dynamics import Batch
 from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.training.reptile import Reptile
@@ -49,7 +44,6 @@ from famle_envs.engines import ENGINES
 ROBOTS = ("reacher", "ant", "quadruped", "minitaur")
 """Robots that are timed."""
 
-_SITUATIONS = 20  # of untrained models
 _ROWS_IN_CACHE = 2500  # of a product
 _MOST_CANDIDATES = 50_000  # embeddings and sums; more take more memory than a small computer has
 
@@ -86,14 +80,11 @@ class Args:
                 raise ValueError(f"There is nothing to time of {', '.join(unknown)}. Known: {', '.join(known)}.")
 
 
-# --- what is timed ----------------------------------------------------------------------------------------------------
-
-
 def planning(robot: str, args: Args) -> dict[str, float]:
     """Times plans at our defaults and at the paper's budget against the bare matrix products of the same shapes."""
-    ratios, times, obs = dict[str, float](), dict[str, float](), _make(robot).reset(seed=0)[0]
+    ratios, times, obs = dict[str, float](), dict[str, float](), robot_of(robot).reset(seed=0)[0]
     for mode in ("ours", "paper"):
-        agent = _agent(robot, mode)
+        agent = agent_of(robot, mode)
         planner, model = agent.config.planner, agent.policy.model
         # Bare products are fastest where what they work on stays in the processor's cache.
         parts = -(-planner.candidates // _ROWS_IN_CACHE)
@@ -107,8 +98,8 @@ def planning(robot: str, args: Args) -> dict[str, float]:
 
 def adaptation(robot: str, args: Args) -> dict[str, float]:
     """Times an adaptation with a full memory against the bare products of its gradient steps."""
-    agent = _agent(robot)
-    adapter, state, how = agent.controller.adapter, _experienced(agent, 1), agent.config.adaptation.gradient
+    agent = agent_of(robot)
+    adapter, state, how = agent.controller.adapter, experienced(agent, 1), agent.config.adaptation.gradient
     if how is None:
         (adapt,) = medians(args.repeats, partial(adapter.adapt, state.memory, state.belief))
         return {"adaptation (ms)": adapt}
@@ -136,7 +127,7 @@ def selection(robot: str, args: Args) -> dict[str, float]:
             candidates = n + (n - 1) * (n - 2) // 2 if compose else n
             if candidates > _MOST_CANDIDATES:
                 continue
-            observe = _observe(_agent(robot, situations=n, compose=compose, adapt_every=10**6))
+            observe = taking_in(agent_of(robot, situations=n, compose=compose, adapt_every=10**6))
             sizes.append(n)
             milliseconds += medians(max(3, args.repeats // 4), observe)
         name = "embeddings and their sums" if compose else "embeddings"
@@ -148,20 +139,20 @@ def selection(robot: str, args: Args) -> dict[str, float]:
 def training(robot: str, args: Args) -> dict[str, float]:
     """Times inner gradient steps of Algorithm 1 against bare products, and a port of it that does one by one."""
     k, size, data = 20, 32, 500
-    builder = _agent(robot).policy.builder
-    model = replace(builder, config=replace(builder.config, members=1)).dynamics(_SITUATIONS)
-    x, y = torch.randn(_SITUATIONS, data, model.n_features + model.action_dim), torch.randn(1, 1, model.obs_dim)
-    batch = Batch(x, y.expand(_SITUATIONS, data, -1).contiguous(), torch.ones(_SITUATIONS, data))
+    builder = agent_of(robot).policy.builder
+    model = replace(builder, config=replace(builder.config, members=1)).dynamics(SITUATIONS)
+    x, y = torch.randn(SITUATIONS, data, model.n_features + model.action_dim), torch.randn(1, 1, model.obs_dim)
+    batch = Batch(x, y.expand(SITUATIONS, data, -1).contiguous(), torch.ones(SITUATIONS, data))
     chance = torch.Generator().manual_seed(0)
-    ours = Reptile(10**6, meta_batch_size=_SITUATIONS, batch_size=size).steps(model, batch, InnerLoop(k), chance)
-    products = bare_products(model, _SITUATIONS, size, backward=True)
-    meta, one_by_one, bare = medians(
+    ours = Reptile(10**6, meta_batch_size=SITUATIONS, batch_size=size).steps(model, batch, InnerLoop(k), chance)
+    products = bare_products(model, SITUATIONS, size, backward=True)
+    meta, sequential, bare = medians(
         max(3, args.repeats // 4),
         partial(next, ours),
         OneByOne(model, batch, InnerLoop(k), size).situation,
         partial(repeat, k, products),
     )
-    step, port, raw = meta / (k * _SITUATIONS), one_by_one / k, bare / (k * _SITUATIONS)
+    step, port, raw = meta / (k * SITUATIONS), sequential / k, bare / (k * SITUATIONS)
     return {
         "steps of a sequential port / ours (time)": port / step,
         "ours / bare products": step / raw,
@@ -175,7 +166,7 @@ def environment(robot: str, args: Args) -> dict[str, float]:
     """Times a step of the environment in each engine against the bare physics, and a second of its own time."""
     ratios, times = dict[str, float](), dict[str, float]()
     for engine in ENGINES:
-        env: Any = _make(robot, engine=engine).unwrapped
+        env: Any = robot_of(robot, engine=engine).unwrapped
         action = np.full(env.action_space.shape, 0.3)
         bare = partial(env.world.simulate, env.physics_steps)
         step, raw = medians(5 * args.repeats, partial(env.step, action), bare)
@@ -191,15 +182,15 @@ def collection(robot: str, args: Args) -> dict[str, float]:
 
     The time of the processor in one process; the wall time with one process and with two.
     """
-    agent = _agent(robot)
-    sources = agent.situation_envs().sources[:_SITUATIONS]
+    agent = agent_of(robot)
+    sources = agent.situation_envs().sources[:SITUATIONS]
     names = [f"situation {i}" for i in range(len(sources))]
     plans, chance = agent.planning_policy(), make_held_uniform(agent.config.simulation.action_hold)
     envs = [source() if callable(source) else source for source in sources]
     kinds: dict[str, tuple[MakePolicy | MakeBatchPolicy, int]] = {
         "by chance": (chance, args.transitions),
         "planned": (plans, max(2, args.transitions // 50)),
-        "planned one by one": (_one_by_one(plans), max(2, args.transitions // 50)),
+        "planned one by one": (one_by_one(plans), max(2, args.transitions // 50)),
     }
     calls = [partial(collect, envs, names, n, policy, 0) for policy, n in kinds.values()]
     times = medians(max(3, args.repeats // 4), *calls, warm_up=1)
@@ -225,8 +216,8 @@ def collection(robot: str, args: Args) -> dict[str, float]:
 
 def control(robot: str, args: Args) -> dict[str, float]:
     """Times whole control steps against the robot's period: plan, simulation, evidence and adaptation."""
-    agent = _agent(robot)
-    env = FAMLEWrapper(_make(robot), agent)
+    agent = agent_of(robot)
+    env = FAMLEWrapper(robot_of(robot), agent)
     obs, _ = env.reset(seed=0)
     milliseconds = np.zeros(args.steps)
     for i in range(args.steps):
@@ -263,11 +254,11 @@ class _TimedLog(AdaptationLog):
 
 def logging(robot: str, args: Args) -> dict[str, float]:
     """Times what TensorBoard takes of the control steps of an episode."""
-    agent = _agent(robot)
+    agent = agent_of(robot)
     with tempfile.TemporaryDirectory() as folder:
         logger = configure(folder, ["tensorboard"])
         log = _TimedLog(agent, logger)
-        env = FAMLEWrapper(_make(robot), agent, log)
+        env = FAMLEWrapper(robot_of(robot), agent, log)
         (obs, _), start = env.reset(seed=0), time.process_time()
         for _ in range(args.steps):
             obs, _, terminated, truncated, _ = env.step(agent.predict(obs)[0])
@@ -286,10 +277,10 @@ def logging(robot: str, args: Args) -> dict[str, float]:
 
 def many_robots(robot: str, args: Args) -> dict[str, float]:
     """Times plans and adaptations of many robots at once, a robot."""
-    agent, chance, figures = _agent(robot), torch.Generator().manual_seed(0), dict[str, float]()
+    agent, chance, figures = agent_of(robot), torch.Generator().manual_seed(0), dict[str, float]()
     plans, adaptations = list[float](), list[float]()
     for robots in args.batches:
-        state = _experienced(agent, robots)
+        state = experienced(agent, robots)
         obs, starts = state.memory.obs[:, -1], torch.zeros(robots, dtype=torch.bool)
         plan, adapt = medians(
             1 if robots > 8 else args.repeats // 4,
@@ -310,14 +301,14 @@ def many_robots(robot: str, args: Args) -> dict[str, float]:
 
 def growth(robot: str, args: Args) -> dict[str, float]:
     """Fits how the cost of a plan grows with its size, and that of taking in a transition with the memory."""
-    obs, repeats = _make(robot).reset(seed=0)[0], max(3, args.repeats // 4)
+    obs, repeats = robot_of(robot).reset(seed=0)[0], max(3, args.repeats // 4)
     figures = dict[str, float]()
     for setting, sizes in (("horizon", (5, 10, 20, 40)), ("candidates", (32, 128, 512, 2048))):
         settings: list[dict[str, Any]] = [{setting: size} for size in sizes]
-        plans = [partial(_agent(robot, **one).predict, obs) for one in settings]
+        plans = [partial(agent_of(robot, **one).predict, obs) for one in settings]
         figures[f"plan: growth with {setting}"] = growth_of(sizes, medians(repeats, *plans))
     memories = (100, 1000, 10_000)
-    takes = [_observe(_agent(robot, memory_size=size, adapt_every=10**6)) for size in memories]
+    takes = [taking_in(agent_of(robot, memory_size=size, adapt_every=10**6)) for size in memories]
     figures["a transition: growth with M"] = growth_of(memories, medians(repeats, *takes))
     return figures
 
@@ -338,7 +329,7 @@ def start_up(robot: str, args: Args) -> dict[str, float]:
 def first_action(robot: str) -> None:
     """Makes an agent and has it act once."""
     torch.set_num_threads(1)
-    _agent(robot).predict(_make(robot).reset(seed=0)[0])
+    agent_of(robot).predict(robot_of(robot).reset(seed=0)[0])
 
 
 PARTS: Mapping[str, Callable[[str, Args], Mapping[str, float]]] = {
@@ -372,58 +363,6 @@ def main(args: Args) -> None:
             print(
                 f"\n{robot}, {part}:", pd.Series(figures).to_string(float_format="{:.4g}".format), sep="\n", flush=True
             )
-
-
-# --- what it is timed on ----------------------------------------------------------------------------------------------
-
-
-def _make(robot: str, engine: str = Task.engine) -> gym.Env[Any, Any]:
-    env = gym.make(known_robots()[robot].env_id, engine=engine)
-    env.reset(seed=0)
-    return env
-
-
-def _agent(robot: str, mode: str = "ours", situations: int = _SITUATIONS, **settings: Any) -> FAMLE:
-    """Makes an agent with an untrained model."""
-    agent = FAMLE(_make(robot), mode, seed=0, device="cpu", pretrained=False, **settings)
-    model = agent.policy.builder.dynamics(situations)
-    agent.policy.world = WorldModel(model, tuple(f"situation {i}" for i in range(situations)))
-    return agent
-
-
-def _one_by_one(plans: MakeBatchPolicy) -> MakePolicy:
-    """Has a policy of several situations act for one at a time."""
-
-    def make(env: gym.Env[Any, Any], situation: int, rng: np.random.Generator) -> Policy:
-        policy = plans([env], [situation], rng)
-        return lambda obs, episode_start: policy(obs[None], np.array([episode_start]))[0]
-
-    return make
-
-
-def _experienced(agent: FAMLE, robots: int) -> OnlineState:
-    """Makes the state of robots whose memory is full."""
-    state, chance = agent.policy.initial(robots), torch.Generator().manual_seed(0)
-
-    def some(like: Tensor) -> Tensor:
-        return 0.1 * torch.randn(like.shape, generator=chance)
-
-    old = state.memory
-    memory = replace(
-        old,
-        obs=some(old.obs),
-        action=some(old.action),
-        next_obs=some(old.next_obs),
-        weight=torch.ones_like(old.weight),
-    )
-    return replace(state, memory=memory, last=(memory.obs[:, -1], memory.action[:, -1]))
-
-
-def _observe(agent: FAMLE) -> Callable[[], object]:
-    """Has a robot take in a transition: judged by each candidate, remembered, and the posterior updated."""
-    state = _experienced(agent, 1)
-    obs, goes_on = state.memory.obs[:, -1], torch.zeros(1, dtype=torch.bool)
-    return partial(torch.no_grad()(agent.controller.observe), state, obs, goes_on)
 
 
 if __name__ == "__main__":

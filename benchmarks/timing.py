@@ -28,8 +28,8 @@ from benchmarks.reporting.study import ROBOT_ALONE, STEPS_IN_TURNS
 from benchmarks.results import provenance, store
 from benchmarks.runner import launch
 from benchmarks.task import Task
+from benchmarks.untrained import robot_of
 from famle_agent import AMPC, AMPCMAML, FAMLE, ModelBasedAgent
-from famle_agent.agents.presets import known_robots
 from famle_agent.planning import RandomShooting
 from famle_envs import Situation
 
@@ -72,7 +72,7 @@ class Args:
 def in_turns(robot: str, args: Args) -> dict[str, list[float]]:
     """Times control steps of all methods, adaptation or learning and the robot included; ms a step in each turn."""
     agents = _hardly_trained(robot)
-    env = _make(robot)
+    env = robot_of(robot)
     turns: dict[str, list[float]] = {name: [] for name in (ROBOT_ALONE, *agents)}
     for _ in range(args.turns):
         turns[ROBOT_ALONE].append(_robot_alone(env, args.turn_steps))
@@ -97,12 +97,6 @@ def main(args: Args) -> None:
         store(args.out / "timing.csv", rows, keys=("robot", "part", "threads"))
         medians = pd.Series({name: np.median(milliseconds) for name, milliseconds in turns.items()})
         print(f"\n{robot}, {STEPS_IN_TURNS}, {args.threads} thread(s), medians:", medians.to_string(), sep="\n")
-
-
-def _make(robot: str) -> gym.Env[Any, Any]:
-    env = gym.make(known_robots()[robot].env_id, engine=Task.engine)
-    env.reset(seed=0)
-    return env
 
 
 def _hardly_trained(robot: str) -> dict[str, BaseAlgorithm]:
