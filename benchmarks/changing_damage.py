@@ -158,7 +158,7 @@ def run(robot: str, change: str, seed: int, cache: Path) -> list[Result]:
     damage = [how.gains(before, after, bed.phase) for before, after in ((intact, first), (first, second))]
     schedule = np.concatenate([np.tile(intact, (bed.phase, 1)), *damage])
     env = FAMLEWrapper(make_faulty(bed.env_id, max_episode_steps=bed.episode), agent)
-    rewards = live(env, schedule, seed)
+    rewards = rollout(env, schedule, seed)
     env.close()
     phases, half = rewards.reshape(3, bed.phase), bed.phase // 2
     return [
@@ -172,8 +172,8 @@ def run(robot: str, change: str, seed: int, cache: Path) -> list[Result]:
     ]
 
 
-def live(env: FAMLEWrapper, schedule: Array, seed: int) -> Array:
-    """Lives through gains of motors (steps, motors), over any number of episodes; returns the rewards, (steps,)."""
+def rollout(env: FAMLEWrapper, schedule: Array, seed: int) -> Array:
+    """Runs through gains of motors (steps, motors), over any number of episodes; returns the rewards, (steps,)."""
     set_situation, rewards, known = env.get_wrapper_attr("set_situation"), np.zeros(len(schedule)), None
     obs, _ = env.reset(seed=seed)
     for i, gain in enumerate(map(tuple, schedule)):

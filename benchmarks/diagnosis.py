@@ -138,8 +138,8 @@ def agent_of(robot: str, cache: Path) -> FAMLE:
     return agent
 
 
-def diagnose(robot: str, number: int, args: Args) -> list[Result]:
-    """Lives one case and notes what is said of it on the way."""
+def run(robot: str, number: int, args: Args) -> list[Result]:
+    """Runs one case, and notes what is said of it on the way."""
     case = list(ours(robot, args.steps) if robot in OURS else bed(robot))[number]
     agent = agent_of(robot, args.cache)
     agent.set_random_seed(number)
@@ -197,7 +197,7 @@ def main(args: Args) -> None:
     for robot in args.robots:
         cases = list(ours(robot, args.steps) if robot in OURS else bed(robot))
         agent_of(robot, args.cache)
-        batches = [Batch(robot, (i,), partial(diagnose, robot, i, args)) for i in range(len(cases))]
+        batches = [Batch(robot, (i,), partial(run, robot, i, args)) for i in range(len(cases))]
         run_batches(batches, table, args.jobs, args.backend)
     print(summary(load(table)).round(2).to_string())
 

@@ -279,7 +279,7 @@ def actor_of(method: str, name: str, seed: int, cache: Path, change: tuple[str, 
     return Learnt(as_policy(world.actor_critic, agent.action_space))
 
 
-def episode(env: Env, actor: Actor, seed: int) -> tuple[float, list[float]]:
+def rollout(env: Env, actor: Actor, seed: int) -> tuple[float, list[float]]:
     """Runs the first episode of a robot; returns its return, and the seconds that each action took to choose."""
     env = actor.begin(env)
     env.action_space.seed(seed)
@@ -302,7 +302,7 @@ def run(method: str, name: str, seed: int, lives: int, cache: Path, change: tupl
     test, choosing = BEDS[name]().test, list[float]()
     returns, steps = {robot: list[float]() for robot in test}, {robot: list[int]() for robot in test}
     for (robot, make), life in product(test.items(), range(lives)):
-        total, seconds = episode(make(), actor, 1000 + seed + 100 * life)
+        total, seconds = rollout(make(), actor, 1000 + seed + 100 * life)
         returns[robot].append(total)
         steps[robot].append(len(seconds))
         choosing += seconds

@@ -23,7 +23,8 @@ import torch
 from benchmarks.methods import from_cache
 from benchmarks.results import Result, load
 from benchmarks.runner import Batch, Execution, launch, run_batches
-from famle_agent import FAMLE, FAMLEWrapper, ModelBasedAgent
+from famle_agent import FAMLE, FAMLEWrapper
+from famle_agent.rollout import rollout
 from famle_envs import Situation
 from famle_envs.reacher import ReacherEnv
 
@@ -86,29 +87,20 @@ def agent_of(name: str, seed: int, cache: Path) -> tuple[FAMLE, float | None]:
     return agent, None if known else time.process_time() - start
 
 
-def live(name: str, replicates: int, cache: Path) -> list[Result]:
-    """Lets one agent live on all test arms, one after the other."""
+def run(name: str, replicates: int, cache: Path) -> list[Result]:
+    """Runs one agent on all test arms, one after the other."""
     agent, learning = agent_of(name, 0, cache)
     results = list[Result]()
     for situation in drawn(0, replicates):
         agent.forget()
         agent.set_random_seed(0)
         env = FAMLEWrapper(gym.make("FamleReacher-v0", situation=situation), agent)
-        returns = [episode(env, agent, number) for number in range(EPISODES)]
+        returns = [round(rollout(env, number).total, 2) for number in range(EPISODES)]
         env.close()
         results.append(
             {"situation": str(situation), "returns": returns, "cpu_seconds": learning, "judge_ms": judge_ms(agent)}
         )
     return results
-
-
-def episode(env: FAMLEWrapper, agent: ModelBasedAgent, seed: int) -> float:
-    """Lives one episode; returns its return."""
-    (obs, _), total, ended = env.reset(seed=seed), 0.0, False
-    while not ended:
-        obs, reward, terminated, truncated, _ = env.step(agent.predict(obs)[0])
-        total, ended = total + float(reward), terminated or truncated
-    return round(total, 2)
 
 
 @torch.no_grad()
@@ -136,7 +128,7 @@ def main(args: Args) -> None:
     """Runs what is not stored, and prints what more situations give."""
     table = args.out / "many-situations.csv"
     for name in args.sets:
-        batch = Batch(name, tuple(range(args.replicates)), partial(live, name, args.replicates, args.cache))
+        batch = Batch(name, tuple(range(args.replicates)), partial(run, name, args.replicates, args.cache))
         run_batches([batch], table, args.jobs, args.backend)
     print(summary(load(table)).round(2).to_string())
 

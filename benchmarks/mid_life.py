@@ -16,12 +16,12 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from benchmarks.many_situations import episode
 from benchmarks.methods import METHODS, model_based
 from benchmarks.results import Result, load
 from benchmarks.runner import Options, compare, launch
 from benchmarks.task import Task
 from famle_agent import FAMLEWrapper
+from famle_agent.rollout import rollout
 from famle_envs import Situation
 from famle_envs.reacher import ReacherEnv
 
@@ -44,7 +44,7 @@ def run(method: str, tasks: Sequence[Task], episodes: int) -> list[Result]:
     for number in range(episodes):
         if number == 1:
             env.unwrapped.set_situation(task.later)  # type: ignore[attr-defined]
-        returns.append(episode(env, agent, number))
+        returns.append(round(rollout(env, number).total, 2))
     env.close()
     return [{"situation": str(task.later), "believed": agent.diagnose().situation, "returns": returns}]
 

@@ -144,7 +144,7 @@ def main(args: Args) -> None:
     for robot in args.robots:
         agent = agent_of(robot, args.seed)
         for fault in args.faults or FAULTS:
-            row = drive(agent, robot, fault, args.steps, args.seed)
+            row = run(agent, robot, fault, args.steps, args.seed)
             row |= {"robot": robot, "fault": fault, **provenance(sys.argv)}
             store(file, [row], keys=("robot", "fault"))
     print(load(file).drop(columns=["command", "commit", "versions"]).to_string(index=False))
@@ -161,7 +161,7 @@ def agent_of(robot: str, seed: int) -> FAMLE:
     return agent
 
 
-def drive(agent: FAMLE, robot: str, fault: str, steps: int, seed: int) -> Result:
+def run(agent: FAMLE, robot: str, fault: str, steps: int, seed: int) -> Result:
     """Counts what comes out of some steps with a fault."""
     agent.forget()
     agent.set_random_seed(seed)

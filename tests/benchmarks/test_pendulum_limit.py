@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from benchmarks.gym_robots import Actor as AtRandom
-from benchmarks.gym_robots import Hanging, episode
+from benchmarks.gym_robots import Hanging, rollout
 from benchmarks.pendulum_limit import best_return
 
 
 @pytest.mark.parametrize(("mass", "length"), [(1.0, 1.0), (1.7, 0.3)])
 def test_nothing_is_better_than_the_limit(mass: float, length: float) -> None:
     limit = best_return(mass, length, states=101, torques=5)
-    at_random, _ = episode(Hanging(mass, length), AtRandom(), seed=0)
+    at_random, _ = rollout(Hanging(mass, length), AtRandom(), seed=0)
     resting = -200 * np.pi**2
     assert resting < at_random < limit < 0.0
 
