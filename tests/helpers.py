@@ -23,7 +23,7 @@ from famle_agent.adaptation.candidates import Candidates
 from famle_agent.adaptation.memory import Memory
 from famle_agent.adaptation.posterior import window_posterior
 from famle_agent.adaptation.update import descend, select
-from famle_agent.models.dynamics import Dynamics, Theta
+from famle_agent.models.dynamics import Batch, Dynamics, Theta
 from famle_agent.models.gradient_steps import InnerLoop
 from famle_agent.models.observation import DIMS, ObservationLayout
 from famle_envs.engines import resolve_engine
@@ -178,6 +178,11 @@ def random_transitions(model: Dynamics, *shape: int) -> tuple[Tensor, Tensor, Te
 
 def rows_of(theta: Theta, rows: slice) -> Theta:
     return {name: value[rows] for name, value in theta.items()}
+
+
+def log_likelihood(model: Dynamics, data: Batch, h: Tensor, theta: Theta | None = None) -> Tensor:
+    """Log p(s' | s, a, h) of each transition with the fitted noise, a mean over the members, (B, n)."""
+    return model.log_density(model.residuals(data, h, theta))
 
 
 def memory_of(model: Dynamics, candidates: Candidates, obs: Tensor, action: Tensor, next_obs: Tensor) -> Memory:

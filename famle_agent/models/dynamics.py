@@ -270,29 +270,23 @@ class Dynamics(nn.Module):
         error = (self.forward(batch.x, h, theta) - y).square().mean(dim=-1)  # (B, P, n)
         return 0.5 * (error * weight).sum(dim=-1) / weight.sum(dim=-1).clamp(min=1.0)
 
-    def log_likelihood(self, batch: Batch, h: Tensor, theta: Theta | None = None) -> Tensor:
-        """Computes log p(s' | s, a, h) of each transition with the fitted noise, a mean over the members, (B, n).
-
-        It is 0 for padding, and of normalised targets. Arguments as for :meth:`loss`.
-        """
-        weight = _with_members(batch.weight, axes=3)
-        return self.log_density(self.residuals(batch, h, theta), weight=weight)
-
     def residuals(self, batch: Batch, h: Tensor, theta: Theta | None = None) -> Tensor:
-        """Computes the errors of the normalised targets, in fitted deviations, (B, P, n, obs_dim)."""
+        """Computes the errors of the normalised targets, in fitted deviations, (B, P, n, obs_dim).
+
+        Arguments as for :meth:`loss`; padding has errors, too.
+        """
         noise = self._of(self.noise_std, len(h))[:, :, None]  # (B, P, 1, obs_dim)
         return (self.forward(batch.x, h, theta) - _with_members(batch.y)) / noise
 
-    def log_density(self, residual: Tensor, excess: Tensor | float = 1.0, weight: Tensor | float = 1.0) -> Tensor:
-        """Computes log p of transitions with given residuals, a mean over the members, (B, n).
+    def log_density(self, residual: Tensor, excess: Tensor | float = 1.0) -> Tensor:
+        """Computes log p(s' | s, a, h) of normalised targets by their residuals, a mean over the members, (B, n).
 
         Args:
             residual: As of :meth:`residuals`, (B, P, n, obs_dim).
             excess: By how much the noise is above the fitted one, broadcast to the residuals.
-            weight: 1 for a transition and 0 for padding, broadcast to (B, P, n).
         """
         noise = self._of(self.noise_std, len(residual))[:, :, None] * excess
-        log_p = (log_density(residual / excess, self.degrees_of_freedom) - noise.log()).sum(dim=-1) * weight
+        log_p = (log_density(residual / excess, self.degrees_of_freedom) - noise.log()).sum(dim=-1)
         # An observation beyond all measure would make every likelihood -inf and a posterior meaningless.
         return log_p.mean(dim=1).clamp(min=-1e30)
 

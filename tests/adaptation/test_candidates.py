@@ -12,7 +12,7 @@ from famle_agent.adaptation.belief import prior
 from famle_agent.adaptation.candidates import Candidates
 from famle_agent.models.dynamics import Batch, Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
-from tests.helpers import adapted, memory_of, models, random_transitions, simple_model
+from tests.helpers import adapted, log_likelihood, memory_of, models, random_transitions, simple_model
 
 numbers_of_situations = st.integers(1, 6)
 NAMES = ("intact", "a", "b", "c", "d", "e")
@@ -88,8 +88,8 @@ def test_likelihood_equals_that_of_each_candidate_alone(model: Dynamics, compose
         row = torch.tensor([[robot]])
         alone = Batch(data.x[row[0]], data.y[row[0]], data.weight[row[0]])
         for number in range(len(candidates.pairs)):
-            each = model.log_likelihood(alone, candidates.h[:, :, number])
-            torch.testing.assert_close(together[robot, :, number], each[0].detach(), rtol=1e-4, atol=1e-3)
+            each = log_likelihood(model, alone, candidates.h[:, :, number])[0].detach() * alone.weight[0]
+            torch.testing.assert_close(together[robot, :, number], each, rtol=1e-4, atol=1e-3)
 
 
 def gains(gain: list[float], n: int = 60, seed: int = 3) -> tuple[Tensor, Tensor, Tensor]:
@@ -142,8 +142,8 @@ def test_two_faults_are_named_where_they_add_up(two_motors: Dynamics, gain: list
 def test_data_of_two_faults_fit_neither_alone(two_motors: Dynamics) -> None:
     data = two_motors.encode(*gains([0.0, 0.0]))
     candidates = Candidates.of(two_motors, compose=True)
-    log_likelihood = candidates.log_likelihood(two_motors, data)[0].sum(dim=0)
-    assert log_likelihood[4:].max() > log_likelihood[:4].max() + 50
+    log_p = candidates.log_likelihood(two_motors, data)[0].sum(dim=0)
+    assert log_p[4:].max() > log_p[:4].max() + 50
     memory = memory_of(two_motors, candidates, *gains([0.0, 0.0]))
     belief = adapted(two_motors, candidates, memory, InnerLoop(0, 0.0, 0.0))
     marginal = candidates.marginal(belief.posterior)[0]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from famle_agent.models.dynamics import Batch, Dynamics
 from famle_agent.models.members import with_members
-from tests.helpers import models, random_h, random_theta, random_transitions, simple_model
+from tests.helpers import log_likelihood, models, random_h, random_theta, random_transitions, simple_model
 
 every_likelihood = pytest.mark.parametrize("degrees_of_freedom", [0.0, 3.0])
 
@@ -23,7 +23,7 @@ def log_likelihood_per_member(model: Dynamics, data: Batch) -> Tensor:
     """Of all transitions together, (P,)."""
     alone = [with_members(model, 1, member) for member in range(model.members)]
     c = torch.arange(model.n_situations)
-    return torch.stack([one.log_likelihood(data, one.embeddings_of(c)).sum() for one in alone])
+    return torch.stack([log_likelihood(one, data, one.embeddings_of(c)).sum() for one in alone])
 
 
 def exact_batch(model: Dynamics, n: int) -> Batch:
@@ -61,9 +61,6 @@ def test_padding_changes_nothing(model: Dynamics, n: int, padding: int) -> None:
     padded = model.encode(*(torch.cat([a, b], dim=1) for a, b in zip(real, noise, strict=True)), weight)
     data = model.encode(*real)
     torch.testing.assert_close(model.loss(padded, h, theta), model.loss(data, h, theta))
-    density = model.log_likelihood(padded, h, theta)
-    torch.testing.assert_close(density[:, :n], model.log_likelihood(data, h, theta))
-    assert (density[:, n:] == 0).all()
 
 
 def test_nothing_but_padding_has_no_loss() -> None:
@@ -84,14 +81,14 @@ def test_log_likelihood_is_that_of_its_distribution(model: Dynamics, n: int) -> 
     nu = model.degrees_of_freedom
     shape = torch.distributions.StudentT(nu, mean, noise) if nu else torch.distributions.Normal(mean, noise)
     expected = shape.log_prob(data.y[:, None]).sum(dim=-1).mean(dim=1)
-    torch.testing.assert_close(model.log_likelihood(data, h, theta), expected, rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(log_likelihood(model, data, h, theta), expected, rtol=1e-4, atol=1e-3)
 
 
 def densities_of(model: Dynamics, y: Tensor) -> Tensor:
     """Log-density at targets of one dimension."""
     x = torch.zeros(1, len(y), model.n_features + model.action_dim, dtype=y.dtype)
     data = Batch(x, y[None, :, None], torch.ones(1, len(y), dtype=y.dtype))
-    return model.log_likelihood(data, model.embeddings_of(torch.tensor([0])), model.theta_of(1))[0]
+    return log_likelihood(model, data, model.embeddings_of(torch.tensor([0])), model.theta_of(1))[0]
 
 
 @pytest.mark.parametrize("degrees_of_freedom", [0.0, 0.7, 2.0, 3.0, 30.0])
