@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from famle_agent.adaptation.state import OnlineState
-    from famle_agent.agents.adaptation_log import AdaptationLog
     from famle_agent.agents.agent import ModelBasedAgent
     from famle_agent.agents.baselines import AMPC, AMPCMAML
     from famle_agent.agents.config import Config
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
     from famle_agent.agents.wrapper import FAMLEWrapper
     from famle_agent.data.transitions import Transitions
     from famle_agent.data.truncate_on_error import TruncateOnError
+    from famle_agent.monitoring.adaptation_log import AdaptationLog
     from famle_agent.utils.errors import NotLearnedError, SensorError
 
 __all__ = [
@@ -42,7 +42,7 @@ __version__ = version("famle")
 _MODULES = {
     "AMPC": "agents.baselines",
     "AMPCMAML": "agents.baselines",
-    "AdaptationLog": "agents.adaptation_log",
+    "AdaptationLog": "monitoring.adaptation_log",
     "Config": "agents.config",
     "FAMLE": "agents.famle",
     "FAMLEWrapper": "agents.wrapper",

@@ -7,6 +7,6 @@
   ``online_adaptation`` carries their state from step to step. ``wrapper`` is the loop of somebody else's robot.
 - Settings: ``config``, made of flat ``keywords``; ``presets`` has those of each robot.
 - Files: ``checkpoint`` is what they hold, and ``parameters`` the weights alone.
-- Logs: ``logs`` has the scalars that Stable-Baselines3 names. ``adaptation_log`` shows a robot within its episode, with
-  ``held_out``, the errors of predictions, ``pictures``, and ``tensorboard``, which writes.
+
+What is written of an agent while it lives on robots is in :mod:`famle_agent.monitoring`.
 """

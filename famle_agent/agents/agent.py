@@ -26,12 +26,11 @@ from typing_extensions import Self
 from famle_agent.adaptation.adapters import EmbeddingAdapter, GradientAdapter
 from famle_agent.adaptation.belief import Belief
 from famle_agent.adaptation.diagnosis import Diagnosis
+from famle_agent.adaptation.experience import Experience
 from famle_agent.adaptation.state import OnlineState
-from famle_agent.agents.adaptation_log import AdaptationLog, log_belief
 from famle_agent.agents.config import Config
-from famle_agent.agents.logs import close_when_let_go, log_episodes, log_time
 from famle_agent.agents.meta_learning_agent import MetaLearningAgent
-from famle_agent.agents.online_adaptation import Experience, OnlineAdaptation
+from famle_agent.agents.online_adaptation import OnlineAdaptation
 from famle_agent.agents.policy import AdaptivePolicy
 from famle_agent.agents.presets import Robot, make_env, robot_of
 from famle_agent.agents.world_model import Interface
@@ -41,6 +40,8 @@ from famle_agent.data.gate import check_action, reading, vec_readings
 from famle_agent.data.watch import VecWatch
 from famle_agent.models.gradient_steps import prepare_torch
 from famle_agent.models.reward import RewardFn, TerminationFn
+from famle_agent.monitoring.adaptation_log import AdaptationLog, log_belief
+from famle_agent.monitoring.logs import close_when_let_go, log_episodes, log_time
 from famle_agent.utils.chance import alone
 
 __all__ = ["ModelBasedAgent"]

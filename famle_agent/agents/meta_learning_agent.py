@@ -17,15 +17,15 @@ from typing_extensions import Self
 
 from famle_agent.agents.check import Check, check_plans
 from famle_agent.agents.keywords import SAFETY
-from famle_agent.agents.logs import close_when_let_go, console_for_bars
 from famle_agent.agents.meta_training import meta_train, planning_policy, simulate
 from famle_agent.agents.stored_agent import StoredAgent
-from famle_agent.agents.tensorboard import log_embeddings
 from famle_agent.data.description import first_env
 from famle_agent.data.envs import SituationEnvs, SituationsLike, situation_envs
 from famle_agent.data.identity import identity
 from famle_agent.data.policies import MakeBatchPolicy
 from famle_agent.data.transitions import Transitions, check_names
+from famle_agent.monitoring.logs import close_when_let_go, console_for_bars
+from famle_agent.monitoring.tensorboard import log_embeddings
 from famle_agent.training.run_folder import RunFolder
 
 __all__ = ["MetaLearningAgent"]

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from famle_agent.adaptation.experience import Experience
 from famle_agent.adaptation.perception import senses_of
 from famle_agent.adaptation.senses import Senses
 from famle_agent.adaptation.state import OnlineState
@@ -16,31 +17,7 @@ from famle_agent.agents.policy import AdaptivePolicy
 from famle_agent.utils.deadline import Deadline
 from famle_agent.utils.errors import SensorError
 
-__all__ = ["Experience", "OnlineAdaptation"]
-
-
-@dataclass(frozen=True)
-class Experience:
-    """Records the newest step of B robots.
-
-    Attributes:
-        before: What the agent believed when it had taken place.
-        after: What it believes since it learnt from it.
-        transitions: Which robots went through a transition that can be learnt from, (B,).
-        plan_ms: Milliseconds that the plan took; None where somebody else has acted.
-        adapt_ms: Those that learning from it took.
-    """
-
-    before: OnlineState
-    after: OnlineState
-    transitions: Tensor
-    plan_ms: float | None
-    adapt_ms: float
-
-    @property
-    def adapted(self) -> bool:
-        """Whether the robots have adapted in this step."""
-        return self.after.belief.adaptations > self.before.belief.adaptations
+__all__ = ["OnlineAdaptation"]
 
 
 class OnlineAdaptation:

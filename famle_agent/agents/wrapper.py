@@ -11,12 +11,12 @@ import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import RecordConstructorArgs
 
-from famle_agent.agents.adaptation_log import AdaptationLog
 from famle_agent.agents.agent import ModelBasedAgent
 from famle_agent.agents.presets import make_env
 from famle_agent.data import gate
 from famle_agent.data.gate import check_action
 from famle_agent.data.watch import Watch
+from famle_agent.monitoring.adaptation_log import AdaptationLog
 
 __all__ = ["FAMLEWrapper"]
 

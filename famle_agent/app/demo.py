@@ -15,13 +15,13 @@ from rich.table import Table
 from rich.text import Text
 from stable_baselines3.common.logger import configure
 
-from famle_agent.agents.adaptation_log import AdaptationLog
 from famle_agent.agents.checkpoint import check_writable
 from famle_agent.agents.famle import FAMLE
 from famle_agent.agents.presets import known_robots
-from famle_agent.agents.tensorboard import encode_gif, log_gif, log_values, scalar
 from famle_agent.agents.wrapper import FAMLEWrapper
 from famle_agent.app.plots import plot_paths, plot_returns, plot_speed, side_by_side
+from famle_agent.monitoring.adaptation_log import AdaptationLog
+from famle_agent.monitoring.tensorboard import encode_gif, log_gif, log_values, scalar
 from famle_agent.rollout import Rollout, rollout
 
 __all__ = ["DEMOS", "Demo", "run_demo"]

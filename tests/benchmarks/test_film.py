@@ -7,7 +7,7 @@ from PIL import Image
 from stable_baselines3.common.logger import configure
 
 from benchmarks.film import draw_posterior, read_events, read_posterior, shrink
-from famle_agent.agents.tensorboard import encode_gif, log_values, scalar
+from famle_agent.monitoring.tensorboard import encode_gif, log_values, scalar
 
 README_FILM = Path(__file__).parents[2] / "docs" / "pictures" / "ant.gif"
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from famle_agent.adaptation.experience import Experience
 from famle_agent.adaptation.perception import senses_of
 from famle_agent.adaptation.state import OnlineState
-from famle_agent.agents.online_adaptation import Experience
-from famle_agent.agents.pictures import Path
-from famle_agent.agents.policy import AdaptivePolicy
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.simulator import Simulator
+from famle_agent.monitoring.logged_agent import LoggedPolicy
+from famle_agent.monitoring.pictures import Path
 
 __all__ = ["Models", "Step", "Window"]
 
@@ -90,13 +90,13 @@ class Models:
     after: Simulator
 
     @classmethod
-    def of(cls, policy: AdaptivePolicy, known: OnlineState) -> Models:
+    def of(cls, policy: LoggedPolicy, known: OnlineState) -> Models:
         """Takes what the robots have before their first step."""
         new = policy.initial(known.robots)
         begins = policy.adapter.model_for(known.belief, known.memory)
         return cls(policy.adapter.model_for(new.belief, new.memory), begins, begins)
 
-    def adapted(self, policy: AdaptivePolicy, newest: Experience) -> Models:
+    def adapted(self, policy: LoggedPolicy, newest: Experience) -> Models:
         """Takes what they had before an adaptation, and after it."""
         states = newest.before, newest.after
         return Models(self.unadapted, *(policy.adapter.model_for(state.belief, state.memory) for state in states))

@@ -8,20 +8,19 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 import numpy as np
 import torch
 from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
+from famle_agent.adaptation.experience import Experience
 from famle_agent.adaptation.perception import senses_of
 from famle_agent.adaptation.state import OnlineState
-from famle_agent.agents.held_out import Models, Step, Window
-from famle_agent.agents.online_adaptation import Experience
-from famle_agent.agents.pictures import Array, Path, draw_paths, draw_posterior, liveliest
-from famle_agent.agents.policy import AdaptivePolicy
-from famle_agent.agents.tensorboard import log_embeddings, log_settings, log_values, picture, scalar, shows, text
+from famle_agent.monitoring.held_out import Models, Step, Window
+from famle_agent.monitoring.logged_agent import LoggedAgent
+from famle_agent.monitoring.pictures import Array, Path, draw_paths, draw_posterior, liveliest
+from famle_agent.monitoring.tensorboard import log_embeddings, log_settings, log_values, picture, scalar, shows, text
 from famle_agent.utils.allowance import Allowance
 
 __all__ = ["AdaptationLog", "belief_scalars", "log_belief"]
@@ -31,43 +30,6 @@ _STEPS = 10  # between two entries of an agent that never adapts while an episod
 _MOMENTS = 1000  # of the picture of the posterior
 _PATHS = 20  # of the picture of what was predicted
 _METRICS = ("episode/return_so_far", "prediction/error_after", "rollout/ep_rew_mean")
-
-
-class LoggedAgent(Protocol):
-    """An agent, as far as its log knows it.
-
-    Attributes:
-        mode: The settings that it began with.
-        seed: Of its chance.
-    """
-
-    mode: str
-    seed: int | None
-
-    @property
-    def policy(self) -> AdaptivePolicy:
-        """Its settings, and what it has learnt."""
-
-    @property
-    def situations(self) -> Sequence[str]:
-        """What the training situations are called."""
-
-    @property
-    def overruns(self) -> int:
-        """How often planning took too long."""
-
-    @property
-    def cut_short(self) -> int:
-        """How often the planner left out iterations."""
-
-    def posterior(self, state: OnlineState | None = None) -> dict[str, float]:
-        """Says how likely each situation is by name; without a state, as far as the agent knows now."""
-
-    def marginals(self, state: OnlineState) -> dict[str, float]:
-        """Says how likely each training situation is, alone or as a part."""
-
-    def diagnose(self, state: OnlineState) -> object:
-        """Says in words what is most likely wrong."""
 
 
 class AdaptationLog:

@@ -14,8 +14,8 @@ from stable_baselines3.common.logger import Logger, configure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from famle_agent import FAMLE, Transitions
-from famle_agent.agents.tensorboard import encode_gif, log_gif
 from famle_agent.app.plots import plot_returns
+from famle_agent.monitoring.tensorboard import encode_gif, log_gif
 from tests.conftest import QUICK
 
 

@@ -21,8 +21,8 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from famle_agent import AMPC, FAMLE, AdaptationLog, FAMLEWrapper, ModelBasedAgent, Transitions
 from famle_agent.adaptation.belief import Belief
-from famle_agent.agents.pictures import Path as Way
-from famle_agent.agents.pictures import draw_paths, draw_posterior, liveliest
+from famle_agent.monitoring.pictures import Path as Way
+from famle_agent.monitoring.pictures import draw_paths, draw_posterior, liveliest
 from famle_agent.utils.allowance import Allowance
 
 Load = Callable[..., FAMLE]
