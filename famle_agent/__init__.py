@@ -1,5 +1,8 @@
 """Robots that adapt to damage: FAMLE, its rivals, its wrapper and what they are made of.
 
+To read the code, begin with Algorithm 2 in :mod:`famle_agent.adaptation.controller`, and with Algorithm 1 in
+:mod:`famle_agent.training.trainer`.
+
 Names are imported when they are first used, so that the command line answers before PyTorch is there.
 """
 

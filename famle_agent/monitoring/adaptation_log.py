@@ -17,9 +17,9 @@ from torch import Tensor
 from famle_agent.adaptation.experience import Experience
 from famle_agent.adaptation.perception import senses_of
 from famle_agent.adaptation.state import OnlineState
-from famle_agent.monitoring.held_out import Models, Step, Window
+from famle_agent.monitoring.held_out import HeldOut, LoggedStep, Models
 from famle_agent.monitoring.logged_agent import LoggedAgent
-from famle_agent.monitoring.pictures import Array, Path, draw_paths, draw_posterior, liveliest
+from famle_agent.monitoring.pictures import Array, PredictedPath, draw_paths, draw_posterior, liveliest
 from famle_agent.monitoring.tensorboard import log_embeddings, log_settings, log_values, picture, scalar, shows, text
 from famle_agent.utils.allowance import Allowance
 
@@ -60,11 +60,11 @@ class AdaptationLog:
         self._agent, self._logger, self._steps, self._shown = agent, logger, steps, shows(logger)
         self._allowance, self._entries, self._drawn_at = Allowance(share, clock), 0, steps
         self._newest: Experience | None = None
-        self._window = list[Step]()
+        self._unlogged = list[LoggedStep]()
         self._models: Models | None = None
         self._rewards, self._return, self._diagnosis = list[float](), 0.0, ""
         self._posteriors: deque[tuple[int, Tensor]] = deque(maxlen=_MOMENTS)
-        self._paths: deque[Path] = deque(maxlen=_PATHS)
+        self._paths: deque[PredictedPath] = deque(maxlen=_PATHS)
         if self._shown and not steps:
             self._begin_run()
 
@@ -90,7 +90,7 @@ class AdaptationLog:
 
     def close(self) -> None:
         """Writes what has come since the last time."""
-        if self._newest is not None and self._window:
+        if self._newest is not None and self._unlogged:
             self._write_numbers(self._newest)
         if self._posteriors and self._drawn_at < self._steps:
             self._write_pictures()
@@ -105,9 +105,9 @@ class AdaptationLog:
     def _notice(self, newest: Experience, obs: Tensor, action: Tensor) -> None:
         policy = self._agent.policy
         self._newest, self._models = newest, self._models or Models.of(policy, newest.before)
-        self._window.append(Step.of(newest, obs, action))
+        self._unlogged.append(LoggedStep.of(newest, obs, action))
         self._posteriors.append((self._steps, newest.after.belief.log_posterior[0]))
-        due = newest.adapted if policy.config.adaptation.every else len(self._window) >= _STEPS
+        due = newest.adapted if policy.config.adaptation.every else len(self._unlogged) >= _STEPS
         if due and self._allowance.is_left():
             with self._allowance.spending():
                 self._write_numbers(newest)
@@ -118,13 +118,13 @@ class AdaptationLog:
     @torch.no_grad()
     def _write_numbers(self, newest: Experience) -> None:
         agent, policy = self._agent, self._agent.policy
-        numbers = {**belief_scalars(agent, newest.after), **_milliseconds(self._window)}
+        numbers = {**belief_scalars(agent, newest.after), **_milliseconds(self._unlogged)}
         numbers["step/reward"] = float(np.mean(self._rewards))
         numbers["episode/return_so_far"] = self._return
         if self._models is not None:
-            window = Window.of(self._window)
-            numbers |= self._models.errors(policy.model, window)
-            if path := self._models.path(window, policy.config.planner.horizon, self._steps):
+            held_out = HeldOut.of(self._unlogged)
+            numbers |= self._models.errors(policy.model, held_out)
+            if path := self._models.path(held_out, policy.config.planner.horizon, self._steps):
                 self._paths.append(path)
             if newest.adapted:
                 self._models = self._models.adapted(policy, newest)
@@ -133,7 +133,7 @@ class AdaptationLog:
             self._diagnosis = diagnosis
             values.append(text("diagnosis", diagnosis))
         log_values(self._logger, values, self._steps)
-        self._window, self._rewards = [], []
+        self._unlogged, self._rewards = [], []
 
     def _write_pictures(self) -> None:
         agent, (steps, logits) = self._agent, zip(*self._posteriors, strict=True)
@@ -177,7 +177,7 @@ def belief_scalars(agent: LoggedAgent, state: OnlineState) -> dict[str, float]:
     }
 
 
-def _milliseconds(steps: Sequence[Step]) -> dict[str, float]:
+def _milliseconds(steps: Sequence[LoggedStep]) -> dict[str, float]:
     """Means of what plans and adaptations have taken, where there were any."""
     taken = {
         name: [ms for step in steps if (ms := getattr(step, name)) is not None] for name in ("plan_ms", "adapt_ms")

@@ -14,13 +14,13 @@ from famle_agent.adaptation.state import OnlineState
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.simulator import Simulator
 from famle_agent.monitoring.logged_agent import LoggedPolicy
-from famle_agent.monitoring.pictures import Path
+from famle_agent.monitoring.pictures import PredictedPath
 
-__all__ = ["Models", "Step", "Window"]
+__all__ = ["HeldOut", "LoggedStep", "Models"]
 
 
 @dataclass(frozen=True)
-class Step:
+class LoggedStep:
     """Keeps of a step of B robots what does not take the room of their memories.
 
     Attributes:
@@ -40,14 +40,14 @@ class Step:
     adapt_ms: float | None
 
     @classmethod
-    def of(cls, experience: Experience, obs: Tensor, action: Tensor) -> Step:
+    def of(cls, experience: Experience, obs: Tensor, action: Tensor) -> LoggedStep:
         """Takes it from an experience that began at ``obs`` with ``action``."""
         next_obs, adapt_ms = senses_of(experience.before).obs, experience.adapt_ms if experience.adapted else None
         return cls(obs, action, next_obs, experience.transitions, experience.plan_ms, adapt_ms)
 
 
 @dataclass(frozen=True)
-class Window:
+class HeldOut:
     """The steps since the last entry, n of each of B robots.
 
     Attributes:
@@ -63,7 +63,7 @@ class Window:
     valid: Tensor
 
     @classmethod
-    def of(cls, steps: Sequence[Step]) -> Window:
+    def of(cls, steps: Sequence[LoggedStep]) -> HeldOut:
         """Puts steps side by side."""
         names = ("obs", "action", "next_obs", "valid")
         return cls(*(torch.stack([getattr(step, name) for step in steps], dim=1) for name in names))
@@ -101,29 +101,29 @@ class Models:
         states = newest.before, newest.after
         return Models(self.unadapted, *(policy.adapter.model_for(state.belief, state.memory) for state in states))
 
-    def errors(self, model: Dynamics, window: Window) -> dict[str, float]:
+    def errors(self, model: Dynamics, held_out: HeldOut) -> dict[str, float]:
         """Compares their errors on transitions that none of them has been adapted to, in those of simulation."""
-        if not window.valid.any():
+        if not held_out.valid.any():
             return {}
-        return {f"prediction/error_{name}": _error(model, one, window) for name, one in vars(self).items()}
+        return {f"prediction/error_{name}": _error(model, one, held_out) for name, one in vars(self).items()}
 
-    def path(self, window: Window, horizon: int, last: int) -> Path | None:
+    def path(self, held_out: HeldOut, horizon: int, last: int) -> PredictedPath | None:
         """Predicts where the first robot's actions lead, at most as far as the planner looks; None without any step."""
-        if not (n := min(window.unbroken(), horizon)):
+        if not (n := min(held_out.unbroken(), horizon)):
             return None
-        predicted = [window.obs[:, None, :1].expand(-1, self.after.members, -1, -1)]  # (B, P, 1, obs_dim)
-        for action in window.action[:, :n].unbind(dim=1):
+        predicted = [held_out.obs[:, None, :1].expand(-1, self.after.members, -1, -1)]  # (B, P, 1, obs_dim)
+        for action in held_out.action[:, :n].unbind(dim=1):
             predicted.append(self.after(predicted[-1], action[:, None]))
-        real = torch.cat([window.obs[0, :1], window.next_obs[0, :n]])
-        robots, steps = window.valid.shape
+        real = torch.cat([held_out.obs[0, :1], held_out.next_obs[0, :n]])
+        robots, steps = held_out.valid.shape
         mean = torch.cat(predicted, dim=2)[0].mean(dim=0)
-        return Path(last - robots * steps, real.cpu().numpy(), mean.cpu().numpy())
+        return PredictedPath(last - robots * steps, real.cpu().numpy(), mean.cpu().numpy())
 
 
-def _error(model: Dynamics, simulator: Simulator, window: Window) -> float:
+def _error(model: Dynamics, simulator: Simulator, held_out: HeldOut) -> float:
     """Computes the root mean square of the errors of the next observation, in those of simulation."""
-    obs, noise = window.obs[:, None], model.noise_std[: model.members, None]  # (B, 1, n, obs_dim), (P, 1, obs_dim)
-    predicted = model.layout.change(obs, simulator(window.obs, window.action))  # (B, P, n, obs_dim)
-    off = (predicted - model.layout.change(obs, window.next_obs[:, None])) / (model.target_std * noise)
-    mean_square = off.square().mean(dim=(1, 3))[window.valid].mean()
+    obs, noise = held_out.obs[:, None], model.noise_std[: model.members, None]  # (B, 1, n, obs_dim), (P, 1, obs_dim)
+    predicted = model.layout.change(obs, simulator(held_out.obs, held_out.action))  # (B, P, n, obs_dim)
+    off = (predicted - model.layout.change(obs, held_out.next_obs[:, None])) / (model.target_std * noise)
+    mean_square = off.square().mean(dim=(1, 3))[held_out.valid].mean()
     return float(mean_square.sqrt() / model.usual_error)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
-__all__ = ["Path", "draw_paths", "draw_posterior", "liveliest"]
+__all__ = ["PredictedPath", "draw_paths", "draw_posterior", "liveliest"]
 
 Array = npt.NDArray[Any]
 
@@ -25,7 +25,7 @@ _PANELS = 4
 
 
 @dataclass(frozen=True)
-class Path:
+class PredictedPath:
     """Where a robot went, and where a model said that it would go.
 
     Attributes:
@@ -60,7 +60,7 @@ def draw_posterior(posterior: Array, names: Sequence[str], first: int, last: int
     return sheet
 
 
-def draw_paths(paths: Sequence[Path], dims: Sequence[int]) -> Image.Image:
+def draw_paths(paths: Sequence[PredictedPath], dims: Sequence[int]) -> Image.Image:
     """Draws where a robot went in black, and what was predicted in red, each observed number in a panel of its own.
 
     Args:
@@ -91,7 +91,7 @@ def draw_paths(paths: Sequence[Path], dims: Sequence[int]) -> Image.Image:
     return sheet
 
 
-def liveliest(paths: Sequence[Path], step: Array) -> list[int]:
+def liveliest(paths: Sequence[PredictedPath], step: Array) -> list[int]:
     """Chooses up to four observed numbers to draw: those that change most, measured by how much a step changes them.
 
     Args:

@@ -1,5 +1,13 @@
 """Algorithm 1 of the paper: transitions of N situations become theta_meta and H_meta.
 
+Its lines are in several files, through which ``famle_agent.agents.meta_training`` goes in this order:
+
+    1 to 6   transitions D_c of each situation c     famle_agent.data.collect
+    7, 8     theta and H before they are learnt      famle_agent.agents.meta_training, begin_model
+    9 to 14  theta_meta and H_meta, by Reptile       famle_agent.training.reptile
+
+Here is what learns: joint training, which the paper does not have, and then the meta-learner, Reptile or MAML.
+
 Training is a generator of metrics: whoever wants to log, stop or show a bar does it outside.
 """
 

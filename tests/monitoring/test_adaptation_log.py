@@ -21,8 +21,7 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from famle_agent import AMPC, FAMLE, AdaptationLog, FAMLEWrapper, ModelBasedAgent, Transitions
 from famle_agent.adaptation.belief import Belief
-from famle_agent.monitoring.pictures import Path as Way
-from famle_agent.monitoring.pictures import draw_paths, draw_posterior, liveliest
+from famle_agent.monitoring.pictures import PredictedPath, draw_paths, draw_posterior, liveliest
 from famle_agent.utils.allowance import Allowance
 
 Load = Callable[..., FAMLE]
@@ -284,7 +283,7 @@ def test_picture_of_the_posterior_is_bright_where_a_situation_is_likely() -> Non
 def test_picture_of_a_path_shows_what_changes_and_where_predictions_are_off() -> None:
     real = np.zeros((11, 6))
     real[:, 2], real[:, 4] = np.linspace(0, 1, 11), np.linspace(0, 9, 11)
-    ways = [Way(0, real, real), Way(10, real, real[::-1])]
+    ways = [PredictedPath(0, real, real), PredictedPath(10, real, real[::-1])]
     dims = liveliest(ways, np.array([1, 1, 1, 1, 100, 1.0]))
     assert 2 in dims
     assert len(dims) == 4
