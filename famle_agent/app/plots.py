@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -41,16 +42,11 @@ def plot_returns(returns: Mapping[str, Sequence[float]], title: str, path: str |
         title: Of the picture.
         path: Where the PNG goes.
     """
-    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
-    axes = figure.add_subplot()
-    for name, values in returns.items():
-        axes.plot(range(len(values)), values, marker="o", label=name)
-    axes.axvline(0.5, color="0.4", linestyle="--", linewidth=1)
-    axes.annotate("breaks", (0.5, 1.0), xycoords=("data", "axes fraction"), xytext=(4, -12), textcoords="offset points")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    style(axes, "episode", "return", title)
-    axes.legend()
-    figure.savefig(path, dpi=150)
+    with _picture(path, "episode", "return", title) as axes:
+        for name, values in returns.items():
+            axes.plot(range(len(values)), values, marker="o", label=name)
+        _mark_break(axes, 0.5)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def plot_speed(
@@ -65,22 +61,11 @@ def plot_speed(
         title: Of the picture.
         path: Where the PNG goes.
     """
-    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
-    axes = figure.add_subplot()
-    for name, values in speed.items():
-        axes.plot(np.arange(len(values)) / rate, running_mean(values, round(rate / 2)), label=name)
-    axes.axvline(break_at / rate, color="0.4", linestyle="--", linewidth=1)
-    axes.annotate(
-        "breaks",
-        (break_at / rate, 1.0),
-        xycoords=("data", "axes fraction"),
-        xytext=(4, -12),
-        textcoords="offset points",
-    )
-    axes.axhline(0.0, color="0.8", linewidth=1)
-    style(axes, "time (s)", "forward speed (m/s)", title)
-    axes.legend()
-    figure.savefig(path, dpi=150)
+    with _picture(path, "time (s)", "forward speed (m/s)", title) as axes:
+        for name, values in speed.items():
+            axes.plot(np.arange(len(values)) / rate, running_mean(values, round(rate / 2)), label=name)
+        _mark_break(axes, break_at / rate)
+        axes.axhline(0.0, color="0.8", linewidth=1)
 
 
 def plot_paths(
@@ -97,16 +82,29 @@ def plot_paths(
         path: Where the PNG goes.
         goal: Where they should get to.
     """
+    with _picture(path, "x (m)", "y (m)", title) as axes:
+        for name, way in paths.items():
+            axes.plot(way[:, 0], way[:, 1], marker=".", label=name)
+        if goal is not None:
+            axes.plot(*goal, marker="*", markersize=14, color="0.3", linestyle="none", label="goal")
+        axes.set_aspect("equal", adjustable="datalim")
+
+
+@contextmanager
+def _picture(path: str | os.PathLike[str], xlabel: str, ylabel: str, title: str) -> Iterator[Axes]:
+    """Gives the axes of a picture, which is stored with a legend when all is drawn."""
     figure = Figure(figsize=(6.4, 4.0), layout="constrained")
     axes = figure.add_subplot()
-    for name, way in paths.items():
-        axes.plot(way[:, 0], way[:, 1], marker=".", label=name)
-    if goal is not None:
-        axes.plot(*goal, marker="*", markersize=14, color="0.3", linestyle="none", label="goal")
-    axes.set_aspect("equal", adjustable="datalim")
-    style(axes, "x (m)", "y (m)", title)
+    yield axes
+    style(axes, xlabel, ylabel, title)
     axes.legend()
     figure.savefig(path, dpi=150)
+
+
+def _mark_break(axes: Axes, at: float) -> None:
+    """Marks where the robots break on the axis of time."""
+    axes.axvline(at, color="0.4", linestyle="--", linewidth=1)
+    axes.annotate("breaks", (at, 1.0), xycoords=("data", "axes fraction"), xytext=(4, -12), textcoords="offset points")
 
 
 def side_by_side(
