@@ -24,6 +24,9 @@ __all__ = ["Config", "Hyperparameters", "Rounds", "Safety", "Simulation"]
 class Config:
     """Everything that can be tuned.
 
+    Users give fields by flat keywords, such as ``adapt_every`` for ``adaptation.every``; which is which is said by
+    :mod:`~famle_agent.agents.keywords`.
+
     Attributes:
         simulation: What is simulated to learn from.
         model: The architecture of the dynamics model.

@@ -133,7 +133,7 @@ class AdaptivePolicy:
 
     @property
     def perception(self) -> Perception:
-        """The same on robots whose sensors may fail.
+        """The controller on robots whose sensors may fail.
 
         Raises:
             NotLearnedError: There is no model yet.

@@ -81,7 +81,7 @@ class StoredAgent(BaseAlgorithm):
 
     @property
     def perception(self) -> Perception:
-        """The same on robots whose sensors may fail."""
+        """The controller on robots whose sensors may fail."""
         return self.policy.perception
 
     @property
