@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from famle_agent.utils.deadline import Deadline
+from famle_agent.utils.deadline import Deadline, in_time
 
 __all__ = ["ICEM", "MPPI", "Judge", "Planner", "RandomShooting", "shift"]
 
@@ -117,7 +117,7 @@ class ICEM(Planner):
             elites = _take(elites, judge(elites).topk(min(self.elites, elites.shape[1]), dim=1).indices)
             mean = elites[:, 0]
         keep = max(1, int(self.keep_fraction * self.elites))
-        for _ in _in_time(self.iterations, deadline):
+        for _ in in_time(self.iterations, deadline, at_least=1):
             noise = coloured_noise(start, self.candidates, self.noise_beta, generator)
             tau = (mean[:, None] + std[:, None] * noise).clamp(-1.0, 1.0)
             tau = torch.cat([tau, elites[:, :keep], mean[:, None]], dim=1)
@@ -155,7 +155,7 @@ class MPPI(Planner):
     ) -> tuple[Tensor, Tensor]:
         """See :meth:`Planner.plan`."""
         mean = start
-        for _ in _in_time(self.iterations, deadline):
+        for _ in in_time(self.iterations, deadline, at_least=1):
             noise = self.init_std * coloured_noise(start, self.candidates, self.noise_beta, generator)
             tau = torch.cat([mean[:, None], (mean[:, None] + noise).clamp(-1.0, 1.0)], dim=1)
             tau = tau if proposals is None else torch.cat([tau, proposals], dim=1)
@@ -173,14 +173,6 @@ class MPPI(Planner):
 def shift(plan: Tensor) -> Tensor:
     """Moves a plan (B, H, action_dim) on by one step; its last action is repeated."""
     return torch.cat([plan[:, 1:], plan[:, -1:]], dim=1)
-
-
-def _in_time(iterations: int, deadline: Deadline | None) -> Iterator[int]:
-    """Counts iterations as long as a deadline leaves time for another one."""
-    for i in range(iterations):
-        if deadline is not None and not deadline.leaves_time():
-            return
-        yield i
 
 
 def _take(tau: Tensor, index: Tensor) -> Tensor:

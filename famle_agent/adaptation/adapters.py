@@ -26,6 +26,7 @@ from famle_agent.adaptation.settings import Adaptation, Filter
 from famle_agent.adaptation.update import gradient_steps, select
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.simulator import Simulator
+from famle_agent.utils.deadline import Deadline
 
 __all__ = ["EmbeddingAdapter", "GradientAdapter"]
 
@@ -92,14 +93,14 @@ class EmbeddingAdapter:
         excess = updated_excess(belief.excess, squared, seen)
         return replace(belief, log_posterior=posterior, bias=bias, excess=excess).where(moved, belief)
 
-    def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
+    def adapt(self, memory: Memory, belief: Belief, deadline: Deadline | None = None) -> tuple[Memory, Belief]:
         """Selects the most likely embedding (line 2), then takes k gradient steps on theta and h (line 3)."""
         start = self._selected(belief)
         if self.settings.warm_start:
             changed = self._has_changed(memory, start.candidate) & (start.candidate != belief.candidate)
             memory = memory.begun_anew(changed, start.candidate)
             start = start.where(changed, replace(belief, adaptations=start.adaptations))
-        return memory, gradient_steps(self.model, start, memory, self.settings, self.seed)
+        return memory, gradient_steps(self.model, start, memory, self.settings, self.seed, deadline)
 
     def model_for(self, belief: Belief, memory: Memory) -> Simulator:
         """Returns theta* and h*; where steps go on, the embedding alone as long as it explains the robot better."""
@@ -167,11 +168,11 @@ class GradientAdapter:
         """Returns the belief as it is."""
         return belief
 
-    def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
+    def adapt(self, memory: Memory, belief: Belief, deadline: Deadline | None = None) -> tuple[Memory, Belief]:
         """Takes k gradient steps on theta."""
         start = belief if self.settings.warm_start else self.initial(len(memory.weight))
         start = replace(start, diverged=belief.diverged, adaptations=belief.adaptations + 1)
-        return memory, gradient_steps(self.model, start, memory, self.settings, self.seed)
+        return memory, gradient_steps(self.model, start, memory, self.settings, self.seed, deadline)
 
     def model_for(self, belief: Belief, memory: Memory) -> Simulator:
         """Returns theta*."""

@@ -40,8 +40,11 @@ class Adapter(Protocol):
     def infer(self, memory: Memory, belief: Belief, evidence: Evidence, moved: Tensor) -> Belief:
         """Updates the posterior by the newest transition of the robots that ``moved`` (B,)."""
 
-    def adapt(self, memory: Memory, belief: Belief) -> tuple[Memory, Belief]:
-        """Selects an embedding (line 2), takes gradient steps (line 3), and returns what of the memory still counts."""
+    def adapt(self, memory: Memory, belief: Belief, deadline: Deadline | None = None) -> tuple[Memory, Belief]:
+        """Selects an embedding (line 2), takes gradient steps (line 3), and returns what of the memory still counts.
+
+        Gradient steps for which a deadline leaves no time are left out.
+        """
 
     def model_for(self, belief: Belief, memory: Memory) -> Simulator:
         """Returns the dynamics that a belief stands for."""
@@ -93,13 +96,14 @@ class Controller:
         plan = memory.action.new_zeros(robots, self.planner.horizon, action_dim)
         return OnlineState(memory, belief, plan)
 
-    def observe(self, state: OnlineState, obs: Tensor, starts: Tensor) -> OnlineState:
+    def observe(self, state: OnlineState, obs: Tensor, starts: Tensor, deadline: Deadline | None = None) -> OnlineState:
         """Adds the transition that ends here to the memory (lines 5 and 6), and adapts every K (lines 2 and 3).
 
         Args:
             state: The state after the last action.
             obs: Where the robots are now, (B, obs_dim).
             starts: Which robots were just reset, (B,): what led here is no transition of theirs.
+            deadline: By when to have adapted, if there is one.
         """
         if state.last is None:
             return state
@@ -111,7 +115,8 @@ class Controller:
         if self.adapt_every or self.adapt_at_reset:
             belief = self.adapter.infer(memory, belief, evidence, ~starts)
         if self.adapt_every and steps % self.adapt_every == 0:
-            memory, belief = self.adapter.adapt(memory, belief)
+            by = [] if deadline is None else [deadline]  # which adapters of a user need not know where there is none
+            memory, belief = self.adapter.adapt(memory, belief, *by)
         return replace(state, memory=memory, belief=belief, last=None, steps=steps)
 
     @torch.no_grad()

@@ -28,8 +28,9 @@ class Safety:
         safe_action: What a robot is told after that, in the units of its action space. Empty raises a
             :class:`~famle_agent.utils.errors.SensorError`, but of several robots those without sensors are told to do
             nothing (0, or what is nearest to it) as long as one of them has any, so that the others go on.
-        step_budget_ms: Milliseconds that a step's planning should take at most, and with it the adaptation, where
-            ``predict`` does both: the planner ends early, after its first iteration at the least. None sets no limit.
+        step_budget_ms: Milliseconds that a step's plan and adaptation should take at most, together. Gradient steps for
+            which a plan leaves no time are left out first; then the planner ends early, after its first iteration at
+            the least. None sets no limit.
     """
 
     blind_steps: int | None = None
@@ -81,9 +82,9 @@ class Perception:
         senses = before.after(self.sensors, reading, moved, lambda: self._expected(state))
         return replace(state, senses=senses), moved & before.measured & senses.measured
 
-    def observe(self, state: OnlineState, transitions: Tensor) -> OnlineState:
-        """Learns from the step that ends where robots are, where it is a transition (B,)."""
-        return self.controller.observe(state, senses_of(state).obs, ~transitions)
+    def observe(self, state: OnlineState, transitions: Tensor, deadline: Deadline | None = None) -> OnlineState:
+        """Learns from the step that ends where robots are, where it is a transition (B,), by the deadline, if any."""
+        return self.controller.observe(state, senses_of(state).obs, ~transitions, deadline)
 
     def act(
         self, state: OnlineState, starts: Tensor, generator: torch.Generator, deadline: Deadline | None = None

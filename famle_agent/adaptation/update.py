@@ -14,6 +14,7 @@ from famle_agent.adaptation.posterior import systematic_sample
 from famle_agent.adaptation.settings import Adaptation
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
+from famle_agent.utils.deadline import Deadline
 
 __all__ = ["descend", "gradient_steps", "select"]
 
@@ -41,12 +42,19 @@ def select(model: Dynamics, candidates: Candidates, belief: Belief, spread: bool
     return replace(new, adaptations=belief.adaptations + 1)
 
 
-def gradient_steps(model: Dynamics, start: Belief, memory: Memory, settings: Adaptation, seed: int) -> Belief:
+def gradient_steps(
+    model: Dynamics,
+    start: Belief,
+    memory: Memory,
+    settings: Adaptation,
+    seed: int,
+    deadline: Deadline | None = None,
+) -> Belief:
     """Takes k steps from where a belief is, on all of the memory or on minibatches of it (line 3)."""
     if (steps := settings.gradient) is None:
         return start
     sample = _sample(steps.batch_size, seed, start.adaptations - 1, memory)
-    return descend(model, start, memory, steps.inner_loop(memory.seen), steps.validation_size, sample)
+    return descend(model, start, memory, steps.inner_loop(memory.seen), steps.validation_size, sample, deadline)
 
 
 def _sample(size: int, seed: int, number: int, memory: Memory) -> Sample:
@@ -64,6 +72,7 @@ def descend(
     inner_loop: InnerLoop,
     validation_size: int = 0,
     sample: Sample = whole_memory,
+    deadline: Deadline | None = None,
 ) -> Belief:
     """Line 3: theta*, h* = k gradient steps from where a belief is, each member of the ensemble by itself.
 
@@ -75,11 +84,12 @@ def descend(
         validation_size: The newest transitions, which no gradient step sees. Steps that do not make them more likely
             are taken back, in each member of the ensemble by itself; 0 trusts all steps, as the paper does.
         sample: Chooses the transitions of each step among those it may see.
+        deadline: By when to be done; steps for which there is no time are left out.
     """
     if inner_loop.steps == 0:
         return start
     seen, newest = memory.split(validation_size)
-    theta, h, _ = inner_loop(model, start.theta, start.h, sample(model, seen))
+    theta, h, _ = inner_loop(model, start.theta, start.h, sample(model, seen), deadline)
     if validation_size:
         batch = whole_memory(model, newest)()
         better = model.loss(batch, h, theta) < model.loss(batch, start.h, start.theta)  # (B, P)

@@ -459,13 +459,18 @@ class ModelBasedAgent(MetaLearningAgent):
 
     @property
     def overruns(self) -> int:
-        """How often planning took longer than ``step_budget_ms``."""
+        """How often a step took longer than ``step_budget_ms``."""
         return self._online.overruns
 
     @property
     def cut_short(self) -> int:
         """How often the planner left out iterations, so that it would not."""
         return self._online.cut_short
+
+    @property
+    def left_out(self) -> int:
+        """How many gradient steps were left out, for the same reason."""
+        return self._online.left_out
 
     @torch.inference_mode(mode=False)
     def posterior(self, state: OnlineState | None = None, robot: int = 0) -> dict[str, float]:
@@ -509,8 +514,8 @@ class ModelBasedAgent(MetaLearningAgent):
             ``quarantined``, transitions that were not learnt from, since an observation could not be a measurement;
             ``blind``, observations since the last one that could; ``dropped``, steps that were no transition for
             another reason; ``repeated``, observations that were those of the step before to the last bit. Of all robots
-            together, ``overruns``, how often planning took longer than ``step_budget_ms``, and ``cut_short``, how often
-            it left out iterations.
+            together, ``overruns``, how often a step took longer than ``step_budget_ms``; ``cut_short``, how often its
+            plan left out iterations; and ``left_out``, the gradient steps for which there was no time.
 
         Raises:
             IndexError: There is no such robot.

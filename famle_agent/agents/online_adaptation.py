@@ -33,19 +33,22 @@ class OnlineAdaptation:
     Attributes:
         state: What the agent believes of its robots; None where it has learnt nothing of them.
         newest: The last step that it learnt from, and what became of it.
-        overruns: How often planning took longer than ``step_budget_ms``.
+        overruns: How often a step took longer than ``step_budget_ms``.
         cut_short: How often the planner left out iterations, so that it would not.
+        left_out: How many gradient steps were left out for the same reason.
     """
 
     def __init__(self, policy: AdaptivePolicy) -> None:
         self.state: OnlineState | None = None
         self.newest: Experience | None = None
-        self.overruns = self.cut_short = 0
+        self.overruns = self.cut_short = self.left_out = 0
         self._policy = policy
         self._senses: Senses | None = None  # of the robots that the agent was told of last
         self._told: Experience | None = None  # the newest step, where observe() was told of it
         self._refused: OnlineState | None = None  # a caller's state whose last observation was refused
         self._plan_ms: float | None = None  # what the plan of the step that is under way took
+        self._spent_ms = 0.0  # of that step's budget
+        self._plan_needs_ms = self._gradient_ms = 0.0  # what a plan takes with all iterations, and a gradient step
         self._warned_of_divergence = self._warned_of_sensors = False
 
     # --- a loop of the agent's own ----------------------------------------------------------------------
@@ -75,12 +78,14 @@ class OnlineAdaptation:
         """
         deadline, perception = deadline or self._deadline(), self._policy.perception
         state = perception.begin(state, readings, starts)
-        start = time.perf_counter()
+        start, before_ms = time.perf_counter(), 0.0 if deadline is None else deadline.spent_ms
         planned = perception.act(state, starts, generator, deadline)
         self._plan_ms = 1e3 * (time.perf_counter() - start)
         if deadline is not None:
-            self.overruns += deadline.passed
-            self.cut_short += deadline.cut_short
+            self._spent_ms = deadline.spent_ms
+            self._plan_needs_ms = self._spent_ms - before_ms + deadline.left_out * deadline.turn_ms
+            self.overruns += self._spent_ms > deadline.ms
+            self.cut_short += deadline.left_out > 0
         return planned
 
     def learn(self, state: OnlineState, readings: Tensor, moved: Tensor) -> OnlineState:
@@ -189,13 +194,15 @@ class OnlineAdaptation:
             senses = senses_of(self.state_for(state, robot))
         _check_robot(robot, senses.robots)
         counts = {name: int(count[robot]) for name, count in senses.counts.items()}
-        return {**counts, "overruns": self.overruns, "cut_short": self.cut_short}
+        late = {name: getattr(self, name) for name in ("overruns", "cut_short", "left_out")}
+        return {**counts, **late}
 
     # --- steps of the loops -----------------------------------------------------------------------------
 
-    def _deadline(self) -> Deadline | None:
+    def _deadline(self, reserved_ms: float = 0.0, turn_ms: float = 0.0) -> Deadline | None:
+        """Begins the time of a step, less what is reserved for other work, where the settings limit it."""
         budget = self._policy.config.safety.step_budget_ms
-        return None if budget is None else Deadline(budget, self._policy.device)
+        return None if budget is None else Deadline(budget - reserved_ms, self._policy.device, turn_ms)
 
     def _learnt_from(self, state: OnlineState, readings: Tensor, moved: Tensor) -> OnlineState:
         """Learns from a step that ends here, and notes what became of it; arguments as of :meth:`learn`."""
@@ -204,9 +211,11 @@ class OnlineAdaptation:
         before = replace(before, senses=senses_of(before).dropping(~moved))
         self.newest = self._told = None  # frees the memories of the last step before others are made
         start = time.perf_counter()
-        after = perception.observe(before, transitions)
+        after, deadline = self._observed(before, transitions, self._spent_ms)
+        if deadline is not None:
+            self.overruns += deadline.passed and deadline.ms >= 0.0  # else the plan was late, and is counted
         self.newest = Experience(before, after, transitions, self._plan_ms, 1e3 * (time.perf_counter() - start))
-        self._plan_ms = None
+        self._plan_ms, self._spent_ms = None, 0.0
         self.state, self._senses = after, after.senses
         return after
 
@@ -218,7 +227,18 @@ class OnlineAdaptation:
         sensed, transitions = perception.sense(state, readings, ~starts)
         if self.state is not None and self._told is not None and _same_step(self._told.before, sensed, ~starts):
             return replace(self.state, plan=state.plan, last=None, senses=self._senses)
-        return perception.observe(sensed, transitions)
+        return self._observed(sensed, transitions, self._plan_needs_ms)[0]
+
+    def _observed(
+        self, state: OnlineState, transitions: Tensor, plan_ms: float
+    ) -> tuple[OnlineState, Deadline | None]:
+        """Learns from a step in the time that a plan leaves of the budget, and counts what was left out."""
+        deadline = self._deadline(plan_ms, self._gradient_ms)
+        after = self._policy.perception.observe(state, transitions, deadline)
+        if deadline is not None:
+            self.left_out += deadline.left_out
+            self._gradient_ms = deadline.turn_ms
+        return after, deadline
 
     def _warn_of(self, state: OnlineState) -> None:
         """Warns of the first sensor that failed, and of the first adaptation that diverged."""

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from famle_agent.models.dynamics import Batch, Dynamics, Theta
+from famle_agent.utils.deadline import Deadline, in_time
 
 __all__ = ["InnerLoop", "prepare_torch"]
 
@@ -39,7 +40,12 @@ class InnerLoop:
     optimizer: Literal["sgd", "adam"] = "sgd"
 
     def __call__(
-        self, model: Dynamics, theta: Theta, h: Tensor, sample: Callable[[], Batch]
+        self,
+        model: Dynamics,
+        theta: Theta,
+        h: Tensor,
+        sample: Callable[[], Batch],
+        deadline: Deadline | None = None,
     ) -> tuple[Theta, Tensor, Tensor]:
         """Takes k steps for B situations at once, in each member; none of them influences another.
 
@@ -48,6 +54,7 @@ class InnerLoop:
             theta: Parameters to start from, (B, P, ...); not changed.
             h: Embeddings to start from, (B, P, embedding_dim); not changed.
             sample: Gives the data of each step.
+            deadline: By when to be done; what there is no time for is left out.
 
         Returns:
             theta~, h~ and the loss before each step, (k, B, P).
@@ -58,7 +65,7 @@ class InnerLoop:
         optimizer = {"sgd": torch.optim.SGD, "adam": torch.optim.Adam}[self.optimizer](groups, fused=True)
         losses = []
         with torch.enable_grad():
-            for _ in range(self.steps):
+            for _ in in_time(self.steps, deadline):
                 loss = model.loss(sample(), h, theta)
                 optimizer.zero_grad()
                 loss.sum().backward()  # type: ignore[no-untyped-call]

@@ -174,6 +174,7 @@ def belief_scalars(agent: LoggedAgent, state: OnlineState) -> dict[str, float]:
         **counts,
         "health/overruns": agent.overruns,
         "health/cut_short": agent.cut_short,
+        "health/left_out": agent.left_out,
     }
 
 

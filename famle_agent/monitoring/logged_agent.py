@@ -69,11 +69,15 @@ class LoggedAgent(Protocol):
 
     @property
     def overruns(self) -> int:
-        """How often planning took too long."""
+        """How often a step took too long."""
 
     @property
     def cut_short(self) -> int:
         """How often the planner left out iterations."""
+
+    @property
+    def left_out(self) -> int:
+        """How many gradient steps were left out."""
 
     def posterior(self, state: OnlineState | None = None) -> dict[str, float]:
         """Says how likely each situation is by name; without a state, as far as the agent knows now."""

@@ -3,49 +3,68 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import torch
 
-__all__ = ["Deadline"]
+__all__ = ["Deadline", "in_time"]
 
 
 class Deadline:
     """A moment by which work in turns of about equal length should be done.
 
     Args:
-        ms: Milliseconds from now on.
+        ms: Milliseconds from now on; below 0 it has passed.
         device: Where the work is done; what a GPU has been told is waited for.
+        turn_ms: What is known of :attr:`turn_ms` from before.
         clock: Gives the time in s.
 
     Attributes:
-        cut_short: Whether there was no time for another turn.
+        ms: Milliseconds that there are in all.
+        turn_ms: Milliseconds of the shortest turn so far; 0 as long as none has ended.
+        left_out: Turns for which there was no time.
     """
 
     def __init__(
         self,
         ms: float,
         device: torch.device = torch.device("cpu"),  # noqa: B008 (immutable)
+        turn_ms: float = 0.0,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self._device, self._clock = device, clock
-        self._end = clock() + ms / 1e3
-        self._turn_began: float | None = None
-        self.cut_short = False
+        self.ms, self.turn_ms, self.left_out = ms, turn_ms, 0
+        self._began = clock()
 
-    def leaves_time(self) -> bool:
-        """Says whether a turn as long as the last one would end in time; the first one may begin in any case."""
-        now, began = self._now(), self._turn_began
-        self._turn_began = now
-        self.cut_short = began is not None and now + (now - began) > self._end
-        return not self.cut_short
+    def turns(self, number: int, at_least: int = 0) -> Iterator[int]:
+        """Counts turns as long as another one, as long as the shortest, would end in time.
+
+        Args:
+            number: How many there are to do.
+            at_least: How many begin in any case.
+        """
+        for i in range(number):
+            began = self.spent_ms
+            if i >= at_least and began + self.turn_ms > self.ms:
+                self.left_out += number - i
+                return
+            yield i
+            turn = self.spent_ms - began
+            self.turn_ms = min(self.turn_ms, turn) if self.turn_ms else turn
+
+    @property
+    def spent_ms(self) -> float:
+        """Milliseconds since it began."""
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        return 1e3 * (self._clock() - self._began)
 
     @property
     def passed(self) -> bool:
         """Whether it is later than that."""
-        return self._now() > self._end
+        return self.spent_ms > self.ms
 
-    def _now(self) -> float:
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
-        return self._clock()
+
+def in_time(number: int, deadline: Deadline | None, at_least: int = 0) -> Iterator[int]:
+    """Counts the turns that a deadline leaves time for, see :meth:`Deadline.turns`; all of them where there is none."""
+    return iter(range(number)) if deadline is None else deadline.turns(number, at_least)

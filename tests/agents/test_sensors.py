@@ -186,7 +186,7 @@ def test_observation_that_cannot_be_a_measurement_is_in_no_memory(bad: Callable[
     assert changes.abs().max() < 1.0
     given_state = state if door == "state" else None
     assert agent.health(given_state) == {
-        **dict.fromkeys(("dropped", "repeated", "blind", "overruns", "cut_short"), 0),
+        **dict.fromkeys(("dropped", "repeated", "blind", "overruns", "cut_short", "left_out"), 0),
         "quarantined": 2,
     }
     assert len(robot.actions) == 9

@@ -1,4 +1,4 @@
-"""A step that has to be planned in time."""
+"""A step that has to be planned, and learnt from, in time."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ import torch
 from torch import Tensor
 
 from famle_agent import FAMLEWrapper
+from famle_agent.agents.agent import ModelBasedAgent
+from famle_agent.models.dynamics import Batch, Dynamics
+from famle_agent.models.gradient_steps import InnerLoop
+from famle_agent.models.simulator import Simulator
 from famle_agent.planning import ICEM, MPPI, Planner, RandomShooting
 from famle_agent.utils.deadline import Deadline
 from tests.agents.test_sensors import Cart, agent_of
@@ -52,7 +56,7 @@ def test_planner_returns_its_best_plan_so_far(kind: type[Any], ms: float, iterat
     assert clock.time == pytest.approx(0.01 * iterations)
     for ours, theirs in zip(found, plan(kind(iterations=iterations), JUDGED), strict=True):
         assert torch.equal(ours, theirs)
-    assert deadline.cut_short == (iterations < 5)
+    assert deadline.left_out == 5 - iterations
     assert deadline.passed == (ms < 10)
 
 
@@ -62,7 +66,30 @@ def test_random_shooting_has_one_iteration() -> None:
     found = plan(RandomShooting(), clock.judging(0.01), deadline)
     assert torch.equal(found[1], plan(RandomShooting(), JUDGED)[1])
     assert deadline.passed
-    assert not deadline.cut_short
+    assert deadline.left_out == 0
+
+
+# 5 ms have passed before the steps begin, and each takes 10 ms.
+@pytest.mark.parametrize(("ms", "known", "taken"), [(4, 0, 0), (6, 0, 1), (6, 10, 0), (25, 10, 2), (1000, 10, 5)])
+def test_gradient_steps_for_which_there_is_no_time_are_left_out(ms: float, known: float, taken: int) -> None:
+    clock = Clock()
+    deadline = Deadline(ms, turn_ms=known, clock=clock)
+    clock.time += 0.005
+    torch.manual_seed(0)
+    model = Dynamics(2, 1, n_situations=1, embedding_dim=2, hidden=(6,))
+    data = Batch(torch.randn(1, 8, 3), torch.randn(1, 8, 2), torch.ones(1, 8))
+
+    def sample() -> Batch:
+        clock.time += 0.01
+        return data
+
+    def result(steps: int, deadline: Deadline | None = None) -> Tensor:
+        theta, h = model.theta_of(1), model.embeddings_of(torch.zeros(1, dtype=torch.long))
+        return InnerLoop(steps, optimizer="adam")(model, theta, h, sample, deadline)[1]
+
+    assert torch.equal(result(5, deadline), result(taken))
+    assert deadline.left_out == 5 - taken
+    assert deadline.turn_ms == pytest.approx(10.0 if taken else known)
 
 
 @pytest.mark.parametrize("passes_state", [False, True])
@@ -81,6 +108,67 @@ def test_overruns_are_counted(monkeypatch: pytest.MonkeyPatch, passes_state: boo
             obs, *_ = robot.step(action)
     assert [late.health()[name] for name in ("overruns", "cut_short")] == [3, 3]
     assert [in_time.health()[name] for name in ("overruns", "cut_short")] == [0, 0]
+
+
+@pytest.fixture
+def slow(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """A clock by which each iteration of a planner and each gradient step takes 10 ms, and the rest no time."""
+    clock = Clock()
+
+    def taking_time(do: Callable[..., Tensor]) -> Callable[..., Tensor]:
+        def slowly(*args: Any) -> Tensor:
+            clock.time += 0.01
+            return do(*args)
+
+        return slowly
+
+    monkeypatch.setattr("famle_agent.agents.online_adaptation.Deadline", partial(Deadline, clock=clock))
+    monkeypatch.setattr(Simulator, "returns", taking_time(Simulator.returns))
+    monkeypatch.setattr(Dynamics, "loss", taking_time(Dynamics.loss))
+    return clock
+
+
+def late_after_each_step(agent: ModelBasedAgent, passes_state: bool, steps: int = 4) -> list[tuple[int, ...]]:
+    """What has been counted after each control step: overruns, plans that were cut short, gradient steps left out."""
+    robot = Cart() if passes_state else FAMLEWrapper(Cart(), agent)
+    obs, _ = robot.reset(seed=0)
+    state, counts = None, []
+    for _ in range(steps):
+        action, new = agent.predict(obs, state)
+        state = new if passes_state else None
+        obs, *_ = robot.step(action)
+        counts.append(tuple(agent.health()[name] for name in ("overruns", "cut_short", "left_out")))
+    return counts
+
+
+@pytest.mark.parametrize(
+    ("ms", "expected"),
+    [
+        (51.0, [(0, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 0)]),  # two iterations and three gradient steps
+        (45.0, [(0, 0, 1), (0, 0, 2), (0, 0, 3), (0, 0, 4)]),
+        (25.0, [(1, 0, 2), (1, 0, 5), (1, 0, 8), (1, 0, 11)]),  # how long a gradient step takes has to be seen once
+        (5.0, [(1, 1, 3), (2, 2, 6), (3, 3, 9), (4, 4, 12)]),  # the first iteration is always due
+    ],
+)
+def test_adaptation_gets_what_the_plan_before_it_has_left(
+    slow: Clock, ms: float, expected: list[tuple[int, ...]]
+) -> None:
+    agent = agent_of(planner_iterations=2, adapt_every=1, step_budget_ms=ms)
+    assert late_after_each_step(agent, passes_state=False) == expected
+
+
+@pytest.mark.parametrize(
+    ("ms", "expected"),
+    [
+        (51.0, [(0, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 0)]),
+        (45.0, [(0, 0, 0), (0, 0, 1), (0, 0, 2), (0, 0, 3)]),
+        (25.0, [(0, 0, 0), (0, 1, 2), (0, 1, 5), (0, 1, 8)]),
+        (15.0, [(0, 1, 0), (0, 2, 3), (0, 3, 6), (0, 4, 9)]),  # no gradient steps where a plan lacks time
+    ],
+)
+def test_adaptation_leaves_time_for_the_plan_after_it(slow: Clock, ms: float, expected: list[tuple[int, ...]]) -> None:
+    agent = agent_of(planner_iterations=2, adapt_every=1, step_budget_ms=ms)
+    assert late_after_each_step(agent, passes_state=True) == expected
 
 
 def test_info_counts_overruns() -> None:

@@ -12,7 +12,7 @@ from famle_agent import FAMLE, FAMLEWrapper, NotLearnedError, SensorError
 
 Load = Callable[..., FAMLE]
 MakeEnv = Callable[..., gym.Env[Any, Any]]
-HEALTH = {"quarantined", "blind", "dropped", "repeated", "overruns", "cut_short"}
+HEALTH = {"quarantined", "blind", "dropped", "repeated", "overruns", "cut_short", "left_out"}
 
 
 def run(env: FAMLEWrapper, steps: int, seed: int | None = 0) -> list[dict[str, Any]]:

@@ -35,6 +35,7 @@ NUMBERS = {
     "health/blind",
     "health/cut_short",
     "health/dropped",
+    "health/left_out",
     "health/overruns",
     "health/quarantined",
     "health/repeated",
