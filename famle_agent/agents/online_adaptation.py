@@ -19,6 +19,8 @@ from famle_agent.utils.errors import SensorError
 
 __all__ = ["OnlineAdaptation"]
 
+_FORGETTING = 0.9
+
 
 class OnlineAdaptation:
     """Adapts an agent to its robots step by step, and keeps what it believes of them.
@@ -229,15 +231,14 @@ class OnlineAdaptation:
             return replace(self.state, plan=state.plan, last=None, senses=self._senses)
         return self._observed(sensed, transitions, self._plan_needs_ms)[0]
 
-    def _observed(
-        self, state: OnlineState, transitions: Tensor, plan_ms: float
-    ) -> tuple[OnlineState, Deadline | None]:
+    def _observed(self, state: OnlineState, transitions: Tensor, plan_ms: float) -> tuple[OnlineState, Deadline | None]:
         """Learns from a step in the time that a plan leaves of the budget, and counts what was left out."""
         deadline = self._deadline(plan_ms, self._gradient_ms)
         after = self._policy.perception.observe(state, transitions, deadline)
         if deadline is not None:
             self.left_out += deadline.left_out
-            self._gradient_ms = deadline.turn_ms
+            # Where steps are left out, believe a little less each time that they take so long: one may have been slow.
+            self._gradient_ms = deadline.turn_ms * (_FORGETTING if deadline.left_out else 1.0)
         return after, deadline
 
     def _warn_of(self, state: OnlineState) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 
@@ -16,12 +17,12 @@ class Deadline:
     Args:
         ms: Milliseconds from now on; below 0 it has passed.
         device: Where the work is done; what a GPU has been told is waited for.
-        turn_ms: What is known of :attr:`turn_ms` from before.
+        turn_ms: How long a turn takes, as far as that is known before one has ended; 0 where it is not.
         clock: Gives the time in s.
 
     Attributes:
         ms: Milliseconds that there are in all.
-        turn_ms: Milliseconds of the shortest turn so far; 0 as long as none has ended.
+        turn_ms: Milliseconds of the shortest turn, as soon as one has ended.
         left_out: Turns for which there was no time.
     """
 
@@ -34,7 +35,7 @@ class Deadline:
     ) -> None:
         self._device, self._clock = device, clock
         self.ms, self.turn_ms, self.left_out = ms, turn_ms, 0
-        self._began = clock()
+        self._began, self._shortest = clock(), math.inf
 
     def turns(self, number: int, at_least: int = 0) -> Iterator[int]:
         """Counts turns as long as another one, as long as the shortest, would end in time.
@@ -49,8 +50,7 @@ class Deadline:
                 self.left_out += number - i
                 return
             yield i
-            turn = self.spent_ms - began
-            self.turn_ms = min(self.turn_ms, turn) if self.turn_ms else turn
+            self._shortest = self.turn_ms = min(self._shortest, self.spent_ms - began)
 
     @property
     def spent_ms(self) -> float:

@@ -157,6 +157,22 @@ def test_adaptation_gets_what_the_plan_before_it_has_left(
     assert late_after_each_step(agent, passes_state=False) == expected
 
 
+def test_gradient_step_that_was_slow_once_is_tried_again(slow: Clock) -> None:
+    agent = agent_of(planner_iterations=2, adapt_every=1, adapt_steps=1, step_budget_ms=40.0)
+    env = FAMLEWrapper(Cart(), agent)
+    obs, _ = env.reset(seed=0)
+    loss, left_out = Dynamics.loss, []
+    for step in range(25):
+        action = agent.predict(obs)[0]
+        with pytest.MonkeyPatch.context() as once:
+            if step == 0:
+                once.setattr(Dynamics, "loss", lambda *args: (setattr(slow, "time", slow.time + 0.1), loss(*args))[1])
+            obs, *_ = env.step(action)
+        left_out.append(agent.health()["left_out"])
+    assert left_out[5] == 5
+    assert left_out[-1] == left_out[-2] < 20
+
+
 @pytest.mark.parametrize(
     ("ms", "expected"),
     [
