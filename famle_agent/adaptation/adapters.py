@@ -14,6 +14,7 @@ from torch import Tensor
 
 from famle_agent.adaptation.belief import Belief, Evidence, prior, unadapted
 from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.library import enlarged
 from famle_agent.adaptation.memory import Memory
 from famle_agent.adaptation.posterior import (
     expected_square,
@@ -91,15 +92,18 @@ class EmbeddingAdapter:
         bias = updated_bias(belief.bias, evidence.residual, seen)
         squared = expected_square(belief.posterior, fresh, belief.noise, self.model.degrees_of_freedom)
         excess = updated_excess(belief.excess, squared, seen)
-        return replace(belief, log_posterior=posterior, bias=bias, excess=excess).where(moved, belief)
+        inferred = replace(belief, log_posterior=posterior, bias=bias, excess=excess).where(moved, belief)
+        if belief.library is None:
+            return inferred
+        newest = self.model.encode(*(values[:, -1:] for values in (memory.obs, memory.action, memory.next_obs)))
+        log_p = self._log_density(belief, belief.library.residuals(self.model, newest))
+        return replace(inferred, library=belief.library.judged(log_p, moved))
 
     def adapt(self, memory: Memory, belief: Belief, deadline: Deadline | None = None) -> tuple[Memory, Belief]:
         """Selects the most likely embedding (line 2), then takes k gradient steps on theta and h (line 3)."""
         start = self._selected(belief)
         if self.settings.warm_start:
-            changed = self._has_changed(memory, start.candidate) & (start.candidate != belief.candidate)
-            memory = memory.begun_anew(changed, start.candidate)
-            start = start.where(changed, replace(belief, adaptations=start.adaptations))
+            memory, start = self._going_on(memory, start, replace(belief, adaptations=start.adaptations))
         return memory, gradient_steps(self.model, start, memory, self.settings, self.seed, deadline)
 
     def model_for(self, belief: Belief, memory: Memory) -> Simulator:
@@ -126,16 +130,50 @@ class EmbeddingAdapter:
         """Computes log p of residuals (B, P, C, obs_dim) with the robot's own noise, (B, C)."""
         return self.settings.likelihood_power * self.model.log_density(residual, belief.noise.sqrt())
 
-    def _has_changed(self, memory: Memory, candidate: Tensor) -> Tensor:
-        """Says where a candidate (B,) explains what was seen, or the newest of it, better than what was believed, (B,).
+    def _going_on(self, memory: Memory, selected: Belief, before: Belief) -> tuple[Memory, Belief]:
+        """Returns where steps go on: from the last ones, or where robots have changed from what explains that best.
+
+        That is the selected embedding, or a model of the library, with which the memory comes back that it was learnt
+        from.
+        """
+        explained = memory.explained_by(selected.candidate)
+        changed = self._has_changed(memory, explained) & (selected.candidate != before.candidate)
+        start, known = selected, None
+        library = before.library if self.settings.library_size else None
+        if library is not None:
+            known, evidence = library.likeliest(memory, explained)
+            again = evidence > torch.where(changed, 0.0, self._surprise)
+            start = replace(start, theta=known.theta, h=known.h).where(again, start)
+            explained, changed = torch.where(again[:, None], known.log_p, explained), changed | again
+        since = memory.since(explained)
+        if self.settings.library_size and changed.any():
+            what = before.theta, before.h, memory.without_newest(since), changed
+            library = enlarged(library, *what, self._surprise, self.settings.library_size)
+        memory = memory.begun_anew(changed, explained)
+        if library is not None and known is not None:
+            memory = memory.after(known.memory, since).where(again, memory)
+            library = library.resumed(memory, since, again)
+        return memory, replace(start.where(changed, before), library=library)
+
+    @property
+    def _surprise(self) -> float:
+        """-log(hazard); without a hazard, changes are no surprise that evidence could outweigh."""
+        how = self.settings.evidence
+        return how.surprise if isinstance(how, Filter) else math.inf
+
+    def _has_changed(self, memory: Memory, explained: Tensor) -> Tensor:
+        """Says where something explains what was seen, or the newest of it, better than what was believed, (B,).
 
         With g of :meth:`~famle_agent.adaptation.memory.Memory.gain`: g[0] > 0, or max_j g[j] > -log(hazard). The second
         is the test of a change point by cumulative sums: of a robot that has just broken, most of the memory still
         speaks for what it was.
+
+        Args:
+            memory: What the robots have gone through.
+            explained: Log-likelihood of the newest W transitions under what may be the case, (B, W).
         """
-        how, gain = self.settings.evidence, memory.gain(candidate)
-        surprise = how.surprise if isinstance(how, Filter) else math.inf
-        return (gain[:, 0] > 0.0) | (gain.amax(dim=1) > surprise)
+        gain = memory.gain(explained)
+        return (gain[:, 0] > 0.0) | (gain.amax(dim=1) > self._surprise)
 
     def _selected(self, belief: Belief) -> Belief:
         return select(self.model, self.candidates, belief, self.settings.posterior_sampling)

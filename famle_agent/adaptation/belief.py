@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from famle_agent.adaptation.candidates import Candidates
+from famle_agent.adaptation.library import Library, either
 from famle_agent.models.dynamics import Dynamics, Theta
 
 __all__ = ["Belief", "Evidence", "choose", "prior", "unadapted"]
@@ -42,6 +43,7 @@ class Belief:
         candidate: The candidate with which theta* and h* began, (B,).
         diverged: How many adaptations of each robot left the finite numbers and were taken back, (B,).
         adaptations: How often the robots have adapted.
+        library: What they had learnt before they changed; None where that is nothing.
     """
 
     theta: Theta
@@ -52,6 +54,7 @@ class Belief:
     candidate: Tensor
     diverged: Tensor
     adaptations: int = 0
+    library: Library | None = None
 
     @property
     def posterior(self) -> Tensor:
@@ -72,7 +75,8 @@ class Belief:
         """The belief about one robot alone, as of B = 1."""
         theta = {name: value[robot : robot + 1] for name, value in self.theta.items()}
         rows: dict[str, Any] = {name: value[robot : robot + 1] for name, value in self._rows.items()}
-        return replace(self, theta=theta, **rows)
+        library = None if self.library is None else self.library.of_robot(robot)
+        return replace(self, theta=theta, library=library, **rows)
 
     def is_finite(self) -> Tensor:
         """Says for which robots all parameters are finite numbers, (B,)."""
@@ -85,7 +89,7 @@ class Belief:
             return replace(self if kept.all() else other, adaptations=self.adaptations)
         theta = {name: choose(kept, value, other.theta[name]) for name, value in self.theta.items()}
         rows: dict[str, Any] = {name: choose(kept, value, getattr(other, name)) for name, value in self._rows.items()}
-        return replace(self, theta=theta, **rows)
+        return replace(self, theta=theta, library=either(kept, self.library, other.library), **rows)
 
     @property
     def _rows(self) -> dict[str, Tensor]:

@@ -102,37 +102,72 @@ class Memory:
 
         return Memory(**{name: choose(values, getattr(other, name)) for name, values in vars(self).items()})
 
-    def begun_anew(self, rows: Tensor, candidate: Tensor) -> Memory:
+    def begun_anew(self, rows: Tensor, explained: Tensor) -> Memory:
         """The memory of robots that take their newest transitions for those of another situation.
 
-        They keep those since which that situation explains most more than they believed, t >= argmax_j g[j] of
-        :meth:`gain`.
+        They keep those of :meth:`since`.
 
         Args:
             rows: Which robots do, (B,).
-            candidate: What they believe from now on, and as if they had believed it in these transitions, (B,).
+            explained: Log-likelihood of the newest W transitions under what they believe from now on, and as if they
+                had believed it in these transitions, (B, W).
         """
-        explained, gain = self.explained_by(candidate), self.gain(candidate)
-        age = torch.arange(self.weight.shape[1], 0, -1, device=gain.device)
-        kept = age <= gain.shape[1] - gain.argmax(dim=1, keepdim=True)  # (B, M)
-        weight = torch.where(rows[:, None], self.weight * kept, self.weight)
+        weight = self.weight * self._is_newest(self.since(explained))
+        weight = torch.where(rows[:, None], weight, self.weight)
         own_log_p = torch.where(rows[:, None], explained, self.own_log_p)
         return replace(self, own_log_p=own_log_p, weight=weight)
+
+    def since(self, explained: Tensor) -> Tensor:
+        """Counts the transitions since which something explains most more than was believed, (B,).
+
+        They are t >= argmax_j g[j] of :meth:`gain`.
+
+        Args:
+            explained: Its log-likelihood of the newest W transitions, (B, W).
+        """
+        gain = self.gain(explained)
+        return gain.shape[1] - gain.argmax(dim=1)
+
+    def without_newest(self, n: Tensor) -> Memory:
+        """The same transitions but for the newest n (B,), which weigh nothing."""
+        return replace(self, weight=self.weight * ~self._is_newest(n))
+
+    def after(self, older: Memory, n: Tensor) -> Memory:
+        """The newest n (B,) transitions of each robot after those of an older memory, whose oldest give way."""
+
+        def joined(new: Tensor, old: Tensor) -> Tensor:
+            size = new.shape[1]
+            index = torch.arange(size, device=n.device) + n[:, None]
+            robot = torch.arange(len(n), device=n.device)[:, None]
+            is_old = (index < size).view(*index.shape, *[1] * (new.ndim - 2))
+            return torch.where(is_old, old[robot, index.clamp(max=size - 1)], new)
+
+        return Memory(**{name: joined(values, getattr(older, name)) for name, values in vars(self).items()})
+
+    def _is_newest(self, n: Tensor) -> Tensor:
+        """Says which places hold the newest n (B,) transitions, (B, M)."""
+        return torch.arange(self.weight.shape[1], 0, -1, device=n.device) <= n[:, None]
 
     def better_explained(self, candidate: Tensor) -> Tensor:
         """Says where theta_meta with a candidate (B,) explains the newest W transitions better than the beliefs, (B,).
 
         Both are judged by transitions that no gradient step had seen when they were made.
         """
-        return self.gain(candidate)[:, 0] > 0.0
+        return self.gain(self.explained_by(candidate))[:, 0] > 0.0
 
-    def gain(self, candidate: Tensor) -> Tensor:
-        """Computes by how much better a candidate (B,) explains the transitions from each of the newest W on, (B, W).
+    def gain(self, explained: Tensor) -> Tensor:
+        """Computes by how much better something explains the transitions from each of the newest W on, (B, ..., W).
 
-        The cumulative sum ``g[j] = sum_(t >= j) (l[t, c] - l_own[t])``, where l is :attr:`log_p` and l_own
-        :attr:`own_log_p`: the evidence that the robot has been in situation c since transition j.
+        The cumulative sum ``g[j] = sum_(t >= j) (l[t, c] - l_own[t])``, where l_own is :attr:`own_log_p`: the evidence
+        that the robot has been in situation c since transition j.
+
+        Args:
+            explained: l, its log-likelihood of the newest W transitions, (B, W), or (B, L, W) of several things.
         """
-        return ((self.explained_by(candidate) - self.own_log_p) * self.judging).flip(1).cumsum(dim=1).flip(1)
+        own, judging = self.own_log_p, self.judging
+        if explained.ndim == 3:
+            own, judging = own[:, None], judging[:, None]
+        return ((explained - own) * judging).flip(-1).cumsum(dim=-1).flip(-1)
 
     def explained_by(self, candidate: Tensor) -> Tensor:
         """The log-likelihood of the newest W transitions under a candidate for each robot (B,), (B, W)."""

@@ -83,6 +83,8 @@ class GradientSteps:
             each time (the paper's). FAMLE begins anew where another embedding than the one it began with explains the
             robot better than its adapted model does, with the transitions that selected it alone. Where it is the same
             embedding, the steps go on, but the embedding alone plans as long as it explains more.
+        library_size: How many adapted models a robot keeps from before it changed, each with its memory, for when it is
+            again what it was then; 0 keeps none, as the paper does. It takes ``warm_start`` and a ``hazard``.
     """
 
     length: Steps | Epochs = Steps()
@@ -92,10 +94,13 @@ class GradientSteps:
     batch_size: int = 0
     validation_size: int = 0
     warm_start: bool = False
+    library_size: int = 0
 
     def __post_init__(self) -> None:
         if isinstance(self.length, Epochs) and not self.batch_size:
             raise ValueError("adapt_epochs needs an adapt_batch_size; adapt_steps counts steps on the whole memory.")
+        if self.library_size < 0:
+            raise ValueError(f"library_size counts models, 0 or more; got {self.library_size}.")
 
     def inner_loop(self, seen: int) -> InnerLoop:
         """Returns U^k on the robot.
@@ -160,3 +165,10 @@ class Adaptation:
     def warm_start(self) -> bool:
         """Whether there are gradient steps that go on from where the last ones led."""
         return self.gradient is not None and self.gradient.warm_start
+
+    @property
+    def library_size(self) -> int:
+        """How many adapted models are kept from before a change; 0 where changes are not looked for."""
+        if self.gradient is None or not self.gradient.warm_start or not isinstance(self.evidence, Filter):
+            return 0
+        return self.gradient.library_size

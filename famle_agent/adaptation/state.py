@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from famle_agent.adaptation.belief import Belief
+from famle_agent.adaptation.library import Library, part_of
 from famle_agent.adaptation.memory import Memory
 from famle_agent.adaptation.senses import Senses
 
@@ -43,10 +44,13 @@ class OnlineState:
         """B."""
         return len(self.plan)
 
-    def resized(self, memory_size: int, window: int, horizon: int) -> OnlineState:
-        """The same for another M, W and H."""
+    def resized(self, memory_size: int, window: int, horizon: int, library_size: int) -> OnlineState:
+        """The same for another M, W, H and size of the library."""
         plan = torch.cat([self.plan, torch.zeros_like(self.plan[:, :1]).repeat(1, horizon, 1)], dim=1)[:, :horizon]
-        return replace(self, memory=self.memory.resized(memory_size, window), plan=plan)
+        belief, library = self.belief, self.belief.library
+        if library is not None:
+            belief = replace(belief, library=library.resized(library_size, memory_size, window))
+        return replace(self, memory=self.memory.resized(memory_size, window), belief=belief, plan=plan)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -59,21 +63,21 @@ class OnlineState:
         tensors |= {f"memory.{name}": value for name, value in vars(self.memory).items()}
         names = ("log_posterior", "bias", "excess", "candidate", "diverged")
         belief = {name: getattr(self.belief, name) for name in names}
+        if (library := self.belief.library) is not None:
+            tensors |= {f"library.{name}": value for name, value in library.to_tensors().items()}
         return tensors | belief | {"h": self.belief.h.flatten(0, 1), "plan": self.plan}
 
     @classmethod
     def from_tensors(cls, tensors: dict[str, Tensor], steps: int, adaptations: int, adapted_at: int) -> OnlineState:
         """The inverse of :meth:`to_tensors`; the counts are :attr:`counts`."""
-
-        def part(prefix: str) -> dict[str, Tensor]:
-            return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
-
         log_posterior, candidate = tensors["log_posterior"], tensors["candidate"]
         diverged = tensors.get("diverged", torch.zeros_like(candidate))  # files of version 0.1 do not count
         excess = tensors.get("excess", torch.ones_like(tensors["memory.obs"][:, 0]))  # nor know of other noise
         robots, members = len(candidate), len(tensors["h"]) // len(candidate)
         bias = tensors.get("bias", excess.new_zeros(robots, members, log_posterior.shape[1], excess.shape[1]))
-        theta = {name: value.view(robots, -1, *value.shape[1:]) for name, value in part("theta.").items()}
+        theta = {name: value.view(robots, -1, *value.shape[1:]) for name, value in part_of(tensors, "theta.").items()}
         h = tensors["h"].view(robots, -1, tensors["h"].shape[1])
-        belief = Belief(theta, h, log_posterior, bias, excess, candidate, diverged, adaptations)
-        return cls(Memory(**part("memory.")), belief, tensors["plan"], steps=steps, adapted_at=adapted_at)
+        stored = part_of(tensors, "library.")  # which files of robots that have not changed are without
+        library = Library.from_tensors(stored) if stored else None
+        belief = Belief(theta, h, log_posterior, bias, excess, candidate, diverged, adaptations, library)
+        return cls(Memory(**part_of(tensors, "memory.")), belief, tensors["plan"], steps=steps, adapted_at=adapted_at)

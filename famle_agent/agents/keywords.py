@@ -227,7 +227,7 @@ _NAMES: dict[type, dict[str, str]] = {
     Filter: _same("hazard"),
     GradientSteps: {
         **{name: f"adapt_{name}" for name in ("lr", "embedding_lr", "optimizer", "batch_size")},
-        **_same("validation_size", "warm_start"),
+        **_same("validation_size", "warm_start", "library_size"),
     },
     Steps: {"number": "adapt_steps"},
     Epochs: {"number": "adapt_epochs"},

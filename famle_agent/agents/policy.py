@@ -16,6 +16,7 @@ from famle_agent.adaptation.adapters import EmbeddingAdapter, GradientAdapter
 from famle_agent.adaptation.belief import Belief
 from famle_agent.adaptation.controller import Adapter, Controller
 from famle_agent.adaptation.guide import Guide
+from famle_agent.adaptation.library import Library
 from famle_agent.adaptation.memory import Memory
 from famle_agent.adaptation.perception import Perception
 from famle_agent.adaptation.senses import Sensors
@@ -180,11 +181,14 @@ class AdaptivePolicy:
         """
         how = self.config.adaptation
         state = OnlineState.from_tensors({name: value.to(self.device) for name, value in tensors.items()}, **counts)
-        state = state.resized(how.memory_size, how.window, self.config.planner.horizon)
+        state = state.resized(how.memory_size, how.window, self.config.planner.horizon, how.library_size)
         # With other candidates than the stored agent's, what it has seen cannot be judged by what it knew of them.
         belief = self.adapter.initial(state.robots)
         if state.belief.log_posterior.shape == belief.log_posterior.shape:
             memory, plan = self._no_memory(belief), belief.h.new_zeros(*state.plan.shape[:2], self.model.action_dim)
+            if (library := state.belief.library) is not None:
+                one = Library.of(belief.theta, belief.h, memory, torch.ones_like(library.full[:, 0]))
+                belief = replace(belief, library=one.repeated(library.full.shape[1]))
             _check_shapes(state, OnlineState(memory, belief, plan))
             return state
         warnings.warn(

@@ -113,7 +113,7 @@ def test_robot_that_begins_anew_keeps_what_its_new_situation_explains_better(
 ) -> None:
     old = random_memory(robots, size, candidates, seed)
     rows, candidate = torch.rand(robots) > 0.5, torch.randint(candidates, (robots,))
-    new = old.begun_anew(rows, candidate)
+    new = old.begun_anew(rows, old.explained_by(candidate))
     for robot in range(robots):
         if rows[robot]:
             gain = (old.log_p[robot, :, candidate[robot]] - old.own_log_p[robot]) * old.judging[robot]
@@ -144,7 +144,7 @@ def test_candidate_is_better_where_it_explains_what_counts_better(
 def test_what_explains_as_well_as_the_belief_is_not_better(robots: int, size: int, candidates: int, seed: int) -> None:
     seen, everyone = random_memory(robots, size, candidates, seed), torch.ones(robots, dtype=torch.bool)
     candidate = torch.randint(candidates, (robots,))
-    assert not seen.begun_anew(everyone, candidate).better_explained(candidate).any()
+    assert not seen.begun_anew(everyone, seen.explained_by(candidate)).better_explained(candidate).any()
 
 
 @given(*sizes, st.integers(1, 9), st.integers(1, 9))
