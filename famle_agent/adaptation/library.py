@@ -146,7 +146,7 @@ def enlarged(
 ) -> Library | None:
     """Stores what robots had learnt when they changed, where it explained them better than all else.
 
-    It takes the place of a model that it can hardly be told from.
+    That takes enough evidence to tell it from every embedding. It takes the place of a model that it is not told from.
 
     Args:
         library: What is stored already.
@@ -159,7 +159,7 @@ def enlarged(
     """
     own = (past.own_log_p * past.judging).sum(dim=1)  # (B,)
     embeddings = (past.log_p * past.judging[..., None]).sum(dim=1).amax(dim=1)
-    new = Library.of(theta, h, past, rows & (own > embeddings))
+    new = Library.of(theta, h, past, rows & (own - embeddings > surprise))
     if library is None:
         return new.followed_by(None, size)
     stored = (library.log_p * past.judging[:, None]).sum(dim=2).masked_fill(~library.full, -torch.inf)  # (B, L)
