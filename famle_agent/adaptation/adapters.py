@@ -41,7 +41,8 @@ class EmbeddingAdapter:
     Each transition is judged, and changes the posterior (:meth:`judge`, :meth:`infer`). Every K steps the posterior
     selects an embedding, where gradient steps begin (:meth:`adapt`). With ``warm_start`` they go on from where the last
     ones led. Then theta_meta with the most likely embedding competes with theta* and h*, by the likelihood of
-    transitions before a gradient step has seen them (:meth:`~famle_agent.adaptation.memory.Memory.gain`).
+    transitions before a gradient step has seen them (:meth:`~famle_agent.adaptation.memory.Memory.gain`). With
+    ``library_size``, so do the models of :class:`~famle_agent.adaptation.library.Library`.
 
     Attributes:
         model: Holds theta_meta and H_meta, which must not change while the adapter is used.

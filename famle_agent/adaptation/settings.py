@@ -99,8 +99,6 @@ class GradientSteps:
     def __post_init__(self) -> None:
         if isinstance(self.length, Epochs) and not self.batch_size:
             raise ValueError("adapt_epochs needs an adapt_batch_size; adapt_steps counts steps on the whole memory.")
-        if self.library_size < 0:
-            raise ValueError(f"library_size counts models, 0 or more; got {self.library_size}.")
 
     def inner_loop(self, seen: int) -> InnerLoop:
         """Returns U^k on the robot.
