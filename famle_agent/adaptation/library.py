@@ -146,7 +146,7 @@ def enlarged(
 ) -> Library | None:
     """Stores what robots had learnt when they changed, where it explained them better than all else.
 
-    That takes enough evidence to tell it from every embedding. It takes the place of a model that it is not told from.
+    It takes the place of a model that evidence does not tell it from.
 
     Args:
         library: What is stored already.
@@ -154,12 +154,12 @@ def enlarged(
         h: h*, (B, P, embedding_dim).
         past: What the robots had gone through; of later transitions none has a weight.
         rows: Which robots have changed, (B,).
-        surprise: By how much more of two models one has to explain to be told from the other.
+        surprise: By how much more one of two models has to explain to be told from the other.
         size: How many models each robot keeps; its oldest goes.
     """
     own = (past.own_log_p * past.judging).sum(dim=1)  # (B,)
     embeddings = (past.log_p * past.judging[..., None]).sum(dim=1).amax(dim=1)
-    new = Library.of(theta, h, past, rows & (own - embeddings > surprise))
+    new = Library.of(theta, h, past, rows & (own > embeddings))
     if library is None:
         return new.followed_by(None, size)
     stored = (library.log_p * past.judging[:, None]).sum(dim=2).masked_fill(~library.full, -torch.inf)  # (B, L)
