@@ -14,7 +14,7 @@ from torch import Tensor
 
 from famle_agent.adaptation.belief import Belief, Evidence, prior, unadapted
 from famle_agent.adaptation.candidates import Candidates
-from famle_agent.adaptation.library import enlarged
+from famle_agent.adaptation.library import Library, enlarged
 from famle_agent.adaptation.memory import Memory
 from famle_agent.adaptation.posterior import (
     expected_square,
@@ -144,12 +144,12 @@ class EmbeddingAdapter:
         if library is not None:
             known, evidence = library.likeliest(memory, explained)
             again = evidence > torch.where(changed, 0.0, self._surprise)
-            start = replace(start, theta=known.theta, h=known.h).where(again, start)
+            start = replace(start, theta=known.theta, h=known.h, candidate=known.candidate).where(again, start)
             explained, changed = torch.where(again[:, None], known.log_p, explained), changed | again
         since = memory.since(explained)
         if self.settings.library_size and changed.any():
-            what = before.theta, before.h, memory.without_newest(since), changed
-            library = enlarged(library, *what, self._surprise, self.settings.library_size)
+            new = Library.of(before.theta, before.h, before.candidate, memory.without_newest(since), changed)
+            library = enlarged(library, new, self._surprise, self.settings.library_size)
         memory = memory.begun_anew(changed, explained)
         if library is not None and known is not None:
             memory = memory.after(known.memory, since).where(again, memory)

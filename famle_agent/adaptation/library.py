@@ -23,6 +23,7 @@ class Library:
     Attributes:
         theta: (B, L, P, ...).
         h: (B, L, P, embedding_dim).
+        candidate: With which each model began, (B, L).
         memory: What each model was learnt from; its tensors have an axis L after that of the robots.
         log_p: Log-likelihood under each model of the newest W transitions that the robots went through, (B, L, W).
         full: Which places hold a model, (B, L).
@@ -30,14 +31,23 @@ class Library:
 
     theta: Theta
     h: Tensor
+    candidate: Tensor
     memory: Memory
     log_p: Tensor
     full: Tensor
 
     @classmethod
-    def of(cls, theta: Theta, h: Tensor, memory: Memory, rows: Tensor) -> Library:
-        """Holds one model of each robot in ``rows`` (B,): theta (B, P, ...), h (B, P, embedding_dim) and the memory."""
-        return cls(theta, h, memory, memory.own_log_p, rows).each(lambda values: values[:, None])
+    def of(cls, theta: Theta, h: Tensor, candidate: Tensor, memory: Memory, rows: Tensor) -> Library:
+        """Holds one model of each robot in ``rows`` (B,).
+
+        Args:
+            theta: (B, P, ...).
+            h: (B, P, embedding_dim).
+            candidate: With which it began, (B,).
+            memory: What it was learnt from.
+            rows: Whose model counts.
+        """
+        return cls(theta, h, candidate, memory, memory.own_log_p, rows).each(lambda values: values[:, None])
 
     # --- how well its models explain a robot ------------------------------------------------------------------
 
@@ -128,44 +138,42 @@ class Library:
         """All of it by name."""
         theta = {f"theta.{name}": value for name, value in self.theta.items()}
         memory = {f"memory.{name}": value for name, value in vars(self.memory).items()}
-        return {**theta, **memory, "h": self.h, "log_p": self.log_p, "full": self.full}
+        rest = {name: getattr(self, name) for name in ("h", "candidate", "log_p", "full")}
+        return {**theta, **memory, **rest}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Library:
         """The inverse of :meth:`to_tensors`."""
         memory = Memory(**part_of(tensors, "memory."))
-        return cls(part_of(tensors, "theta."), tensors["h"], memory, tensors["log_p"], tensors["full"])
+        h, candidate, log_p, full = (tensors[name] for name in ("h", "candidate", "log_p", "full"))
+        return cls(part_of(tensors, "theta."), h, candidate, memory, log_p, full)
 
     def each(self, change: Callable[[Tensor], Tensor]) -> Library:
         """The same with all tensors changed alike."""
         return Library.from_tensors({name: change(value) for name, value in self.to_tensors().items()})
 
 
-def enlarged(
-    library: Library | None, theta: Theta, h: Tensor, past: Memory, rows: Tensor, surprise: float, size: int
-) -> Library | None:
+def enlarged(library: Library | None, new: Library, surprise: float, size: int) -> Library | None:
     """Stores what robots had learnt when they changed, where it explained them better than all else.
 
     It takes the place of a model that evidence does not tell it from.
 
     Args:
         library: What is stored already.
-        theta: theta*, (B, P, ...).
-        h: h*, (B, P, embedding_dim).
-        past: What the robots had gone through; of later transitions none has a weight.
-        rows: Which robots have changed, (B,).
+        new: A model of each robot, L = 1, with the memory of what the robot had gone through.
         surprise: By how much more one of two models has to explain to be told from the other.
         size: How many models each robot keeps; its oldest goes.
     """
-    own = (past.own_log_p * past.judging).sum(dim=1)  # (B,)
-    embeddings = (past.log_p * past.judging[..., None]).sum(dim=1).amax(dim=1)
-    new = Library.of(theta, h, past, rows & (own > embeddings))
+    past = new.memory.each(lambda values: values[:, 0])
+    own = (past.own_log_p * past.judging).sum(dim=1, keepdim=True)  # (B, 1)
+    embeddings = (past.log_p * past.judging[..., None]).sum(dim=1).amax(dim=1, keepdim=True)
+    new = new.only(own > embeddings)
     if library is None:
         return new.followed_by(None, size)
     stored = (library.log_p * past.judging[:, None]).sum(dim=2).masked_fill(~library.full, -torch.inf)  # (B, L)
     best, place = stored.max(dim=1, keepdim=True)
-    new = new.only(own[:, None] > best)
-    alike = torch.zeros_like(library.full).scatter(1, place, new.full & (own[:, None] - best < surprise))
+    new = new.only(own > best)
+    alike = torch.zeros_like(library.full).scatter(1, place, new.full & (own - best < surprise))
     return new.followed_by(library.only(~alike), size)
 
 

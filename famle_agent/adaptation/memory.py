@@ -94,6 +94,10 @@ class Memory:
         sizes = {name: window if name in ("log_p", "own_log_p") else size for name in vars(self)}
         return Memory(**{name: fit(values, sizes[name]) for name, values in vars(self).items()})
 
+    def each(self, change: Callable[[Tensor], Tensor]) -> Memory:
+        """The same with all tensors changed alike."""
+        return Memory(**{name: change(values) for name, values in vars(self).items()})
+
     def where(self, kept: Tensor, other: Memory) -> Memory:
         """This memory for the robots in ``kept`` (B,), and the other one for the rest."""
 

@@ -187,7 +187,7 @@ class AdaptivePolicy:
         if state.belief.log_posterior.shape == belief.log_posterior.shape:
             memory, plan = self._no_memory(belief), belief.h.new_zeros(*state.plan.shape[:2], self.model.action_dim)
             if (library := state.belief.library) is not None:
-                one = Library.of(belief.theta, belief.h, memory, torch.ones_like(library.full[:, 0]))
+                one = Library.of(belief.theta, belief.h, belief.candidate, memory, belief.candidate == 0)
                 belief = replace(belief, library=one.repeated(library.full.shape[1]))
             _check_shapes(state, OnlineState(memory, belief, plan))
             return state

@@ -143,7 +143,7 @@ def library_of(full: Tensor, values: Tensor) -> Library:
     """A library whose models all have one number each, (B, L)."""
     one = values[..., None]
     memory = Memory(*[one[..., None]] * 4, one, one)
-    return Library({"w": one}, one, memory, one, full)
+    return Library({"w": one}, one, torch.zeros_like(full, dtype=torch.long), memory, one, full)
 
 
 def models(library: Library | None, robot: int) -> list[float]:
@@ -197,8 +197,8 @@ def test_model_is_kept_that_explained_what_nothing_else_did(
     past = Memory(
         *[torch.ones(1, 1, 1)] * 3, torch.full((1, 1, 1), embedding), torch.full((1, 1), own), torch.ones(1, 1)
     )
-    new = torch.full((1, 1), 77.0)
-    everyone = torch.tensor([True])
-    found = enlarged(library, {"w": new}, new, past, everyone, surprise=5.0, size=3)
+    number, everyone = torch.full((1, 1), 77.0), torch.tensor([True])
+    new = Library.of({"w": number}, number, torch.tensor([0]), past, everyone)
+    found = enlarged(library, new, surprise=5.0, size=3)
     assert models(found, 0) == [77.0 if one == "new" else old[one] for one in kept]
-    assert models(enlarged(library, {"w": new}, new, past, ~everyone, surprise=5.0, size=3), 0) == old
+    assert models(enlarged(library, new.only(~everyone[:, None]), surprise=5.0, size=3), 0) == old
