@@ -129,6 +129,20 @@ def test_robot_that_begins_anew_keeps_what_its_new_situation_explains_better(
 
 
 @given(*sizes)
+def test_newest_transitions_follow_those_of_an_older_memory(robots: int, size: int, candidates: int, seed: int) -> None:
+    new, older = (random_memory(robots, size, candidates, one) for one in (seed, seed + 7 * size))
+    n = torch.randint(new.judging.shape[1] + 1, (robots,))
+    joined, rest = new.after(older, n), new.without_newest(n)
+    for robot, newest in enumerate(n.tolist()):
+        for name, values in vars(joined).items():
+            places = values.shape[1]
+            assert torch.equal(values[robot, places - newest :], getattr(new, name)[robot, places - newest :])
+            assert torch.equal(values[robot, : places - newest], getattr(older, name)[robot, newest:])
+        assert torch.equal(rest.weight[robot, : size - newest], new.weight[robot, : size - newest])
+        assert not rest.weight[robot, size - newest :].any()
+
+
+@given(*sizes)
 def test_candidate_is_better_where_it_explains_what_counts_better(
     robots: int, size: int, candidates: int, seed: int
 ) -> None:
