@@ -156,7 +156,8 @@ class Library:
 def enlarged(library: Library | None, new: Library, surprise: float, size: int) -> Library | None:
     """Stores what robots had learnt when they changed, where it explained them better than all else.
 
-    It takes the place of a model that evidence does not tell it from.
+    That takes evidence that tells it from each embedding. It takes the place of a model that evidence does not tell it
+    from.
 
     Args:
         library: What is stored already.
@@ -167,7 +168,7 @@ def enlarged(library: Library | None, new: Library, surprise: float, size: int) 
     past = new.memory.each(lambda values: values[:, 0])
     own = (past.own_log_p * past.judging).sum(dim=1, keepdim=True)  # (B, 1)
     embeddings = (past.log_p * past.judging[..., None]).sum(dim=1).amax(dim=1, keepdim=True)
-    new = new.only(own > embeddings)
+    new = new.only(own - embeddings > surprise)
     if library is None:
         return new.followed_by(None, size)
     stored = (library.log_p * past.judging[:, None]).sum(dim=2).masked_fill(~library.full, -torch.inf)  # (B, L)

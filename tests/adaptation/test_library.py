@@ -187,7 +187,7 @@ def test_robots_take_the_models_of_one_library_or_the_other(
         (0.0, -9.0, [-99.0, -99.0], ["new", 0, 1]),  # a new one
         (0.0, -9.0, [-99.0, -2.0], ["new", 0]),  # as good as the second, and takes its place
         (0.0, -9.0, [-99.0, 2.0], [0, 1]),  # the second is better
-        (0.0, 1.0, [-99.0, -99.0], [0, 1]),  # an embedding is better
+        (0.0, -4.0, [-99.0, -99.0], [0, 1]),  # an embedding is as good
     ],
 )
 def test_model_is_kept_that_explained_what_nothing_else_did(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,10 @@ import pytest
 
 from benchmarks import returning_damage
 from benchmarks.results import load
-from benchmarks.returning_damage import Args, damage, main, summary
+from benchmarks.returning_damage import LIBRARY_SIZES, Args, damage, main, summary
 from famle_envs import Situation
+
+ROOT = Path(__file__).parents[2]
 
 
 def test_damage_is_of_three_motors_and_not_of_training() -> None:
@@ -48,3 +51,12 @@ def test_summary_has_means_of_the_first_steps() -> None:
     table = pd.DataFrame({"method": ["a", "a"], "errors": [[2.0] * 10, [4.0] * 10]})
     table["rewards"] = [[1.0, 3.0, *[5.0] * 8]] * 2
     assert summary(table).to_numpy().tolist() == [[3.0, 2.0, 3.0, 3.8, 3.0, 4.4, 2.0]]
+
+
+def test_manual_quotes_the_stored_results() -> None:
+    section = (ROOT / "docs" / "results.md").read_text().partition("## Damage that comes back")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| (?:arm|ant|HalfCheetah): [^|]*\|(.*)\|$", section, re.MULTILINE)
+    quoted = [[float(cell) for cell in row.split("|")] for row in rows]
+    stored = summary(load(ROOT / "benchmarks" / "results" / "returning-damage.csv")).drop(columns="robots")
+    methods = [f"{robot}, {method}" for robot in ("arm", "ant", "halfcheetah") for method in LIBRARY_SIZES]
+    np.testing.assert_allclose(quoted, stored.loc[methods].to_numpy(dtype=float), atol=0.0051)
