@@ -27,7 +27,7 @@ from famle_agent import FAMLE
 SETTINGS: dict[str, Any] = {
     "blind_steps": 5,  # without a reading, the model says for 0.1 s where the robot is
     "safe_action": (0.0, 0.0, 0.0),  # then it shall stand still
-    "step_budget_ms": 10.0,  # of a plan and of the gradient steps after it, half of the period
+    "step_budget_ms": 15.0,  # of a plan and of the gradient steps after it, of a period of 20
 }
 LIVES: dict[str, dict[str, Any]] = {
     "adapting": {"adapt_every": 25, "adapt_steps": 5},  # fewer than usual, as a step that adapts takes about a period

@@ -11,6 +11,6 @@ Read in this order:
 5. ``state``, made of ``belief``, ``memory``, ``library`` and more: what robots carry from step to step, as values.
 6. ``settings``: all that can be chosen of the above.
 
-Around it, ``perception`` and ``senses`` keep out what cannot be a measurement, ``guide`` proposes plans (line 4), and
-``diagnosis`` says in words what the posterior says.
+Around it, ``perception`` and ``senses`` keep out what cannot be a measurement, ``guide`` proposes plans (line 4),
+``diagnosis`` says in words what the posterior says, and ``experience`` is what became of a step.
 """
