@@ -276,9 +276,9 @@ def _held() -> dict[str, int]:
 
 
 def _memory() -> float:
-    """What this process holds in memory, in MB."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * resource.getpagesize() / 2**20
+    """What this process holds in memory, in MB, without pages of files, which the system drops as it likes."""
+    lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return int(lines["RssAnon"].split()[0]) / 2**10
 
 
 def _peak() -> float:

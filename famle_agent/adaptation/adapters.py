@@ -78,7 +78,10 @@ class EmbeddingAdapter:
         if self.settings.warm_start:
             adapted = self.model.residuals(transition, belief.h, belief.theta)  # (B, P, 1, obs_dim)
             own = self._log_density(belief, adapted)[:, 0]
-        return Evidence(residual, log_p, own)
+        stored = None
+        if belief.library is not None:
+            stored = self._log_density(belief, belief.library.residuals(self.model, transition))
+        return Evidence(residual, log_p, own, stored)
 
     def infer(self, memory: Memory, belief: Belief, evidence: Evidence, moved: Tensor) -> Belief:
         """Filters over all transitions where a hazard is set, else takes the likelihood of the last (the paper).
@@ -93,12 +96,7 @@ class EmbeddingAdapter:
         bias = updated_bias(belief.bias, evidence.residual, seen)
         squared = expected_square(belief.posterior, fresh, belief.noise, self.model.degrees_of_freedom)
         excess = updated_excess(belief.excess, squared, seen)
-        inferred = replace(belief, log_posterior=posterior, bias=bias, excess=excess).where(moved, belief)
-        if belief.library is None:
-            return inferred
-        newest = self.model.encode(*(values[:, -1:] for values in (memory.obs, memory.action, memory.next_obs)))
-        log_p = self._log_density(belief, belief.library.residuals(self.model, newest))
-        return replace(inferred, library=belief.library.judged(log_p, moved))
+        return replace(belief, log_posterior=posterior, bias=bias, excess=excess).where(moved, belief)
 
     def adapt(self, memory: Memory, belief: Belief, deadline: Deadline | None = None) -> tuple[Memory, Belief]:
         """Selects the most likely embedding (line 2), then takes k gradient steps on theta and h (line 3)."""
@@ -139,22 +137,32 @@ class EmbeddingAdapter:
         """
         explained = memory.explained_by(selected.candidate)
         changed = self._has_changed(memory, explained) & (selected.candidate != before.candidate)
-        start, known = selected, None
         library = before.library if self.settings.library_size else None
-        if library is not None:
-            known, evidence = library.likeliest(memory, explained)
-            again = evidence > torch.where(changed, 0.0, self._surprise)
-            start = replace(start, theta=known.theta, h=known.h, candidate=known.candidate).where(again, start)
-            explained, changed = torch.where(again[:, None], known.log_p, explained), changed | again
+        if library is None:
+            library = self._kept(None, memory, before, memory.since(explained), changed)
+            return memory.begun_anew(changed, explained), replace(selected.where(changed, before), library=library)
+
+        known, evidence = library.likeliest(memory, explained)
+        again = evidence > torch.where(changed, 0.0, self._surprise)  # whose damage has come back, (B,)
+        start = replace(selected, theta=known.theta, h=known.h, candidate=known.candidate).where(again, selected)
+        explained, changed = torch.where(again[:, None], known.log_p, explained), changed | again
+
         since = memory.since(explained)
-        if self.settings.library_size and changed.any():
-            new = Library.of(before.theta, before.h, before.candidate, memory.without_newest(since), changed)
-            library = enlarged(library, new, self._surprise, self.settings.library_size)
+        library = self._kept(library, memory, before, since, changed)
         memory = memory.begun_anew(changed, explained)
-        if library is not None and known is not None:
+        if library is not None and again.any():
             memory = memory.after(known.memory, since).where(again, memory)
             library = library.resumed(memory, since, again)
         return memory, replace(start.where(changed, before), library=library)
+
+    def _kept(
+        self, library: Library | None, memory: Memory, before: Belief, since: Tensor, changed: Tensor
+    ) -> Library | None:
+        """Keeps what robots had learnt that have ``changed`` (B,), until their newest ``since`` (B,) transitions."""
+        if not (self.settings.library_size and changed.any()):
+            return library
+        new = Library.of(before.theta, before.h, before.candidate, memory.without_newest(since), changed)
+        return enlarged(library, new, self._surprise, self.settings.library_size)
 
     @property
     def _surprise(self) -> float:

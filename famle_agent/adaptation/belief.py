@@ -23,11 +23,13 @@ class Evidence:
         residual: Errors of each candidate in fitted deviations, (B, P, C, obs_dim).
         log_p: Its log-likelihood under each candidate, (B, C).
         own_log_p: And under the adapted model, (B,).
+        library_log_p: And under each model of the library, (B, L); None where there is no library.
     """
 
     residual: Tensor
     log_p: Tensor
     own_log_p: Tensor
+    library_log_p: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,12 @@ class Belief:
         rows: dict[str, Any] = {name: value[robot : robot + 1] for name, value in self._rows.items()}
         library = None if self.library is None else self.library.of_robot(robot)
         return replace(self, theta=theta, library=library, **rows)
+
+    def judged(self, evidence: Evidence, moved: Tensor) -> Belief:
+        """The same with what the newest transition of the robots that ``moved`` (B,) says about the library."""
+        if self.library is None or evidence.library_log_p is None:
+            return self
+        return replace(self, library=self.library.judged(evidence.library_log_p, moved))
 
     def is_finite(self) -> Tensor:
         """Says for which robots all parameters are finite numbers, (B,)."""

@@ -111,12 +111,11 @@ class Controller:
         memory = state.memory.add(*state.last, obs, evidence.log_p, evidence.own_log_p, valid=~starts)
         if starts.all() and state.robots == 1:
             return replace(state, last=None)
-        steps = state.steps + 1
+        steps, belief = state.steps + 1, belief.judged(evidence, ~starts)
         if self.adapt_every or self.adapt_at_reset:
             belief = self.adapter.infer(memory, belief, evidence, ~starts)
         if self.adapt_every and steps % self.adapt_every == 0:
-            by = [] if deadline is None else [deadline]  # which adapters of a user need not know where there is none
-            memory, belief = self.adapter.adapt(memory, belief, *by)
+            memory, belief = self.adapter.adapt(memory, belief, deadline)
         return replace(state, memory=memory, belief=belief, last=None, steps=steps)
 
     @torch.no_grad()

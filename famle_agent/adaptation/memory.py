@@ -124,13 +124,12 @@ class Memory:
     def since(self, explained: Tensor) -> Tensor:
         """Counts the transitions since which something explains most more than was believed, (B,).
 
-        They are t >= argmax_j g[j] of :meth:`gain`.
+        They are t >= argmax_j g[j] of :meth:`gain`, of several the last: places that hold nothing add nothing to g.
 
         Args:
             explained: Its log-likelihood of the newest W transitions, (B, W).
         """
-        gain = self.gain(explained)
-        return gain.shape[1] - gain.argmax(dim=1)
+        return self.gain(explained).flip(1).argmax(dim=1) + 1
 
     def without_newest(self, n: Tensor) -> Memory:
         """The same transitions but for the newest n (B,), which weigh nothing."""

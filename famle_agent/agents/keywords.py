@@ -162,9 +162,13 @@ def _gradient(read: _Reader) -> GradientSteps | None:
         length = Steps(number)
     else:
         return None
+    changes = (
+        read["hazard"] and read["warm_start"]
+    )  # else nobody looks for a change, and nothing is kept from before it
     steps: GradientSteps = read.part(
         GradientSteps,
         length=length,
+        library_size=(read if changes else read.idle())["library_size"],
         lr=inherited("adapt_lr", "inner_lr"),
         embedding_lr=inherited("adapt_embedding_lr", "embedding_lr"),
         optimizer=inherited("adapt_optimizer", "inner_optimizer"),
@@ -312,6 +316,7 @@ _NEEDS = {
     **dict.fromkeys((*_NAMES[Adaptation].values(), "hazard"), _ADAPTING),
     "selection_size": f"{_ADAPTING}, and no hazard",
     **dict.fromkeys(_NAMES[GradientSteps].values(), f"{_ADAPTING}, and adapt_steps or adapt_epochs"),
+    "library_size": f"{_ADAPTING}, gradient steps with warm_start, and a hazard",
     "adapt_epochs": _ADAPTING,
     "adapt_steps": f"{_ADAPTING}, and no adapt_epochs",
     **dict.fromkeys(_NOISE.values(), "planner='icem' or 'mppi'"),

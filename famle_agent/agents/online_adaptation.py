@@ -85,7 +85,8 @@ class OnlineAdaptation:
         self._plan_ms = 1e3 * (time.perf_counter() - start)
         if deadline is not None:
             self._spent_ms = deadline.spent_ms
-            self._plan_needs_ms = self._spent_ms - before_ms + deadline.left_out * deadline.turn_ms
+            if planned[1].belief.adaptations == state.belief.adaptations:  # else an episode has ended, and time is its
+                self._plan_needs_ms = self._spent_ms - before_ms + deadline.left_out * deadline.turn_ms
             self.overruns += self._spent_ms > deadline.ms
             self.cut_short += deadline.left_out > 0
         return planned

@@ -102,7 +102,9 @@ def test_library_that_recognises_nothing_changes_nothing(load: Load, tell: Tell)
 
 @pytest.mark.parametrize("settings", [{"hazard": 0.0, "selection_size": 10}, {"warm_start": False}])
 def test_robot_keeps_nothing_where_no_change_is_looked_for(load: Load, tell: Tell, settings: dict[str, object]) -> None:
-    assert stored(live(load(**settings), tell)) == 0
+    with pytest.raises(ValueError, match=r"library_size needs .*warm_start, and a hazard"):
+        load(**settings)
+    assert stored(live(load(**settings, library_size=0), tell)) == 0
 
 
 def test_each_robot_has_its_own(load: Load, tell: Tell) -> None:
@@ -117,6 +119,12 @@ def test_each_robot_has_its_own(load: Load, tell: Tell) -> None:
         assert int(together.belief.library.full[robot].sum()) == stored(agent)
         assert torch.equal(together.state_of(2).memory.weight[robot], agent.state_of(1).memory.weight[0])
         torch.testing.assert_close(together.belief.h[robot], agent.belief.h[0], rtol=0.0, atol=0.2)  # 400 steps add up
+        if (own := agent.belief.library) is not None:  # each model as if there were no other robot
+            mine = together.belief.library.of_robot(robot).resized(stored(agent), 100, own.log_p.shape[2])
+            assert mine is not None
+            assert torch.equal(mine.candidate, own.candidate)
+            torch.testing.assert_close(mine.log_p, own.log_p, rtol=0.05, atol=0.5)
+            torch.testing.assert_close(mine.h, own.h, rtol=0.0, atol=0.2)
 
 
 @pytest.mark.parametrize("size", [0, 1, 5])
@@ -128,6 +136,20 @@ def test_library_is_saved_with_the_agent(load: Load, tell: Tell, tmp_path: Path,
     for one in (agent, loaded):
         tell(one, range(BACK, BACK + AGAIN), [True])
     assert (loaded.state_of(1).memory.seen > LEARNT / 2) == (size > 0)
+
+
+def test_library_is_judged_by_what_the_memory_holds(load: Load, tell: Tell) -> None:
+    """Also while the agent does not adapt."""
+    agent = live(load(), tell, BACK)
+    agent.config = agent.config.changed(adapt_every=0)
+    before = agent.state_of(1)
+    tell(agent, range(BACK, BACK + 5), [True])
+    after = agent.state_of(1)
+    assert before.belief.library is not None
+    assert after.belief.library is not None
+    assert torch.equal(after.memory.own_log_p[:, :-5], before.memory.own_log_p[:, 5:])
+    assert torch.equal(after.belief.library.log_p[:, :, :-5], before.belief.library.log_p[:, :, 5:])
+    assert (after.belief.library.log_p[:, :, -5:] != before.belief.library.log_p[:, :, -5:]).all()
 
 
 def test_agent_that_forgets_has_no_library(load: Load, tell: Tell) -> None:

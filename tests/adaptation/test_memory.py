@@ -278,3 +278,11 @@ def test_newest_transitions_are_split_off(robots: list[list[bool]], newest: int)
     assert (older.weight[:, 6 - newest :] == 0).all()
     assert (newer.weight[:, : 6 - newest] == 0).all()
     assert torch.equal(older.obs, memory.obs)
+
+
+@given(st.integers(1, 8))
+def test_places_that_hold_nothing_are_none_of_the_newest(n: int) -> None:
+    memory = replace(Memory.empty(1, 8, 1, 1, 2, CPU), weight=(torch.arange(8) >= 8 - n).float()[None])
+    better = memory.own_log_p + 1.0
+    assert memory.since(better).tolist() == [n]
+    assert memory.without_newest(memory.since(better)).seen == 0
