@@ -287,9 +287,9 @@ def test_wrapped_robot_adapts_once_a_step_in_any_loop(
 ) -> None:
     calls, adapt = [], EmbeddingAdapter.adapt
 
-    def counted(self: EmbeddingAdapter, memory: Any, belief: Any) -> Any:
+    def counted(self: EmbeddingAdapter, memory: Any, belief: Any, deadline: Any) -> Any:
         calls.append(belief)
-        return adapt(self, memory, belief)
+        return adapt(self, memory, belief, deadline)
 
     agent = load_agent(**FAST)
     env = FAMLEWrapper(make_env(max_episode_steps=10), agent)
