@@ -23,7 +23,7 @@ class Evidence:
         residual: Errors of each candidate in fitted deviations, (B, P, C, obs_dim).
         log_p: Its log-likelihood under each candidate, (B, C).
         own_log_p: And under the adapted model, (B,).
-        library_log_p: And under each model of the library, (B, L); None where there is no library.
+        library_log_p: And under each model of the library, (B, L); None where it was not judged, or there is none.
     """
 
     residual: Tensor
@@ -81,10 +81,16 @@ class Belief:
         return replace(self, theta=theta, library=library, **rows)
 
     def judged(self, evidence: Evidence, moved: Tensor) -> Belief:
-        """The same with what the newest transition of the robots that ``moved`` (B,) says about the library."""
-        if self.library is None or evidence.library_log_p is None:
+        """The same with what the newest transition of the robots that ``moved`` (B,) says about the library.
+
+        Where an adapter has not judged the library, it says nothing: the models count as good as the adapted one.
+        """
+        if self.library is None:
             return self
-        return replace(self, library=self.library.judged(evidence.library_log_p, moved))
+        log_p = evidence.library_log_p
+        if log_p is None:
+            log_p = evidence.own_log_p[:, None].expand(self.library.full.shape)
+        return replace(self, library=self.library.judged(log_p, moved))
 
     def is_finite(self) -> Tensor:
         """Says for which robots all parameters are finite numbers, (B,)."""
@@ -93,8 +99,8 @@ class Belief:
 
     def where(self, kept: Tensor, other: Belief) -> Belief:
         """Takes this belief for the robots in ``kept`` (B,), and the other one for the rest."""
-        if kept.all() or not kept.any():  # as nearly always; copying the networks at each step costs time
-            return replace(self if kept.all() else other, adaptations=self.adaptations)
+        if (everyone := bool(kept.all())) or not kept.any():  # as nearly always; copying networks each step costs time
+            return replace(self if everyone else other, adaptations=self.adaptations)
         theta = {name: choose(kept, value, other.theta[name]) for name, value in self.theta.items()}
         rows: dict[str, Any] = {name: choose(kept, value, getattr(other, name)) for name, value in self._rows.items()}
         return replace(self, theta=theta, library=either(kept, self.library, other.library), **rows)

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from famle_agent.adaptation.memory import Memory
 from famle_agent.models.dynamics import Batch, Dynamics, Theta
+from famle_agent.utils.archive import part_of
 
-__all__ = ["Library", "either", "enlarged", "part_of"]
+__all__ = ["Library", "either", "enlarged"]
 
 
 @dataclass(frozen=True)
@@ -184,8 +185,3 @@ def either(rows: Tensor, mine: Library | None, theirs: Library | None) -> Librar
         return mine
     chosen = [library.only(kept[:, None]) for library, kept in ((mine, rows), (theirs, ~rows)) if library is not None]
     return chosen[0].followed_by(chosen[1] if len(chosen) > 1 else None, max(one.full.shape[1] for one in chosen))
-
-
-def part_of(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Takes the tensors whose names begin with a prefix, by the rest of their names."""
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from famle_agent.adaptation.belief import Belief
-from famle_agent.adaptation.library import Library, part_of
+from famle_agent.adaptation.library import Library
 from famle_agent.adaptation.memory import Memory
 from famle_agent.adaptation.senses import Senses
+from famle_agent.utils.archive import part_of
 
 __all__ = ["OnlineState"]
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from famle_agent.agents.config import Config
 from famle_agent.agents.presets import known_robots
 from famle_agent.models.observation import DIMS
-from famle_agent.utils.archive import pack, unpack
+from famle_agent.utils.archive import pack, part_of, unpack
 from famle_agent.utils.atomic_write import whole_file
 
 __all__ = ["Checkpoint", "File", "check_writable", "joined", "read_checkpoint", "write_checkpoint"]
@@ -210,8 +210,7 @@ class Checkpoint:
 
     def part(self, name: str) -> dict[str, Tensor]:
         """The tensors of one part of the agent, by name; empty where it has none."""
-        prefix = f"{name}/"
-        return {key.removeprefix(prefix): value for key, value in self.tensors.items() if key.startswith(prefix)}
+        return part_of(self.tensors, f"{name}/")
 
     def weights(self) -> dict[str, dict[str, Tensor]]:
         """The weights of each network by its name."""

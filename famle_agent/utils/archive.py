@@ -7,6 +7,7 @@ import json
 import os
 import zipfile
 import zlib
+from collections.abc import Mapping
 from tokenize import TokenError
 from typing import Any, BinaryIO
 
@@ -15,7 +16,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-__all__ = ["DAMAGE", "check_sizes", "pack", "unpack"]
+__all__ = ["DAMAGE", "check_sizes", "pack", "part_of", "unpack"]
 
 _TENSORS = "tensors.safetensors"
 _SIZE = 2**28  # bytes to which a file of any size may unpack
@@ -27,6 +28,11 @@ DAMAGE = (
     *(ArithmeticError, AttributeError, MemoryError, RuntimeError, SystemError, TypeError, ValueError),
 )
 """What readers of zips, JSON and arrays make of bytes that nobody has written like this."""
+
+
+def part_of(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Takes the tensors whose names begin with a prefix, by the rest of their names."""
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
 def pack(meta: Any, tensors: dict[str, Tensor], name: str) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from famle_agent import FAMLE, Transitions
+from famle_agent.adaptation.adapters import EmbeddingAdapter
 from famle_agent.adaptation.library import Library, either, enlarged
 from famle_agent.adaptation.memory import Memory
 from famle_agent.data.action_scaling import to_action_space
@@ -152,6 +154,48 @@ def test_library_is_judged_by_what_the_memory_holds(load: Load, tell: Tell) -> N
     assert (after.belief.library.log_p[:, :, -5:] != before.belief.library.log_p[:, :, -5:]).all()
 
 
+def test_library_that_an_adapter_does_not_judge_wins_nothing(
+    load: Load, tell: Tell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent, judge = live(load(), tell, BACK), EmbeddingAdapter.judge
+    agent.config = agent.config.changed(adapt_every=0)
+    monkeypatch.setattr(EmbeddingAdapter, "judge", lambda *args: replace(judge(*args), library_log_p=None))
+    tell(agent, range(BACK, BACK + AGAIN), [True])
+    state = agent.state_of(1)
+    assert state.belief.library is not None
+    assert torch.equal(state.belief.library.log_p[0, 0, -AGAIN:], state.memory.own_log_p[0, -AGAIN:])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_robots_of_a_batch_go_on_as_if_alone(load: Load, seed: int) -> None:
+    agent, chance, robots = load(adapt_lr=0.0, adapt_embedding_lr=0.0), torch.Generator().manual_seed(seed), 3
+    state = agent.policy.initial(robots)
+    initial, empty = state.belief, state.memory
+
+    def some(like: Tensor) -> Tensor:
+        return torch.randn(like.shape, generator=chance)
+
+    def memory() -> Memory:
+        weight = (torch.rand(empty.weight.shape, generator=chance) > 0.2).float()
+        return replace(empty, log_p=2.0 * some(empty.log_p) - 4.0, own_log_p=3.0 * some(empty.own_log_p), weight=weight)
+
+    library = None
+    for _ in range(2):
+        full = torch.rand(robots, generator=chance) > 0.4
+        one = Library.of(initial.theta, some(initial.h), initial.candidate, memory(), full)
+        library = replace(one, log_p=3.0 * some(one.log_p)).followed_by(library, 2)
+    belief, seen = replace(initial, library=library, log_posterior=some(initial.log_posterior)), memory()
+    together_memory, together = agent.adapter.adapt(seen, belief)
+    for robot in range(robots):
+        of_one = seen.each(lambda values, robot=robot: values[robot : robot + 1])
+        alone_memory, alone = agent.adapter.adapt(of_one, belief.of(robot))
+        for name, value in vars(alone_memory).items():
+            assert torch.equal(getattr(together_memory, name)[robot], value[0])
+        assert torch.equal(together.h[robot], alone.h[0])
+        assert together.candidate[robot] == alone.candidate[0]
+        assert models(together.library, robot) == models(alone.library, 0)
+
+
 def test_agent_that_forgets_has_no_library(load: Load, tell: Tell) -> None:
     agent = live(load(), tell, BACK)
     agent.forget()
@@ -170,7 +214,7 @@ def library_of(full: Tensor, values: Tensor) -> Library:
 
 def models(library: Library | None, robot: int) -> list[float]:
     """The numbers of a robot's models."""
-    return [] if library is None else library.h[robot, library.full[robot], 0].tolist()
+    return [] if library is None else library.h[robot, library.full[robot]].flatten(1)[:, 0].tolist()
 
 
 full_or_not = st.integers(1, 3).flatmap(
