@@ -94,14 +94,19 @@ def from_cache(agent: Agent, path: Path, learn: Callable[[Agent], object] = lamb
     How it adapts and plans is the agent's own: a model outlasts a change of these settings. Of replicates that want it
     at the same time one learns, and the others wait. Learning may keep its progress in the folder :func:`on_its_way`.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(f"{path}.lock"):
+
+    def is_known() -> bool:
         if path.exists():
             agent.take_model(path)
-        if agent.dynamics is None:
-            learn(agent)
-            agent.save(path)
-            shutil.rmtree(on_its_way(path), ignore_errors=True)
+        return agent.dynamics is not None
+
+    if not is_known():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(f"{path}.lock"):
+            if not is_known():
+                learn(agent)
+                agent.save(path)
+                shutil.rmtree(on_its_way(path), ignore_errors=True)
     return agent
 
 
