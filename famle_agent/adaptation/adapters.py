@@ -144,7 +144,8 @@ class EmbeddingAdapter:
 
         known, evidence = library.likeliest(memory, explained)
         again = evidence > torch.where(changed, 0.0, self._surprise)  # whose damage has come back, (B,)
-        start = replace(selected, theta=known.theta, h=known.h, candidate=known.candidate).where(again, selected)
+        stored = replace(selected, theta=known.theta, h=known.h, candidate=known.candidate, recognised=again)
+        start = stored.where(again, selected)
         explained, changed = torch.where(again[:, None], known.log_p, explained), changed | again
 
         since = memory.since(explained)

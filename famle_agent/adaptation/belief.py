@@ -44,6 +44,7 @@ class Belief:
         excess: e, mean square of the rest of the robot's errors in each observed number, (B, obs_dim).
         candidate: The candidate with which theta* and h* began, (B,).
         diverged: How many adaptations of each robot left the finite numbers and were taken back, (B,).
+        recognised: Whether theta* and h* began with a model of the library, since the robot is as it was before, (B,).
         adaptations: How often the robots have adapted.
         library: What they had learnt before they changed; None where that is nothing.
     """
@@ -55,6 +56,7 @@ class Belief:
     excess: Tensor
     candidate: Tensor
     diverged: Tensor
+    recognised: Tensor
     adaptations: int = 0
     library: Library | None = None
 
@@ -121,7 +123,8 @@ def unadapted(model: Dynamics, log_prior: Tensor, robots: int) -> Belief:
     none = torch.zeros(robots, dtype=torch.long, device=model.embeddings.device)
     bias = log_prior.new_zeros(robots, model.members, len(log_prior), model.obs_dim)
     theta, h, excess = model.theta_of(robots), model.embeddings_of(none), bias.new_ones(robots, model.obs_dim)
-    return Belief(theta, h, log_prior.expand(robots, -1), bias, excess, candidate=none, diverged=none)
+    log_posterior = log_prior.expand(robots, -1)
+    return Belief(theta, h, log_posterior, bias, excess, candidate=none, diverged=none, recognised=none > 0)
 
 
 def choose(kept: Tensor, mine: Tensor, theirs: Tensor) -> Tensor:

@@ -62,7 +62,7 @@ class OnlineState:
         """All but :attr:`last` and the counts, for a checkpoint; files have robots and members in one axis."""
         tensors = {f"theta.{name}": value.flatten(0, 1) for name, value in self.belief.theta.items()}
         tensors |= {f"memory.{name}": value for name, value in vars(self.memory).items()}
-        names = ("log_posterior", "bias", "excess", "candidate", "diverged")
+        names = ("log_posterior", "bias", "excess", "candidate", "diverged", "recognised")
         belief = {name: getattr(self.belief, name) for name in names}
         if (library := self.belief.library) is not None:
             tensors |= {f"library.{name}": value for name, value in library.to_tensors().items()}
@@ -73,6 +73,7 @@ class OnlineState:
         """The inverse of :meth:`to_tensors`; the counts are :attr:`counts`."""
         log_posterior, candidate = tensors["log_posterior"], tensors["candidate"]
         diverged = tensors.get("diverged", torch.zeros_like(candidate))  # files of version 0.1 do not count
+        recognised = tensors.get("recognised", torch.zeros_like(candidate, dtype=torch.bool))
         excess = tensors.get("excess", torch.ones_like(tensors["memory.obs"][:, 0]))  # nor know of other noise
         robots, members = len(candidate), len(tensors["h"]) // len(candidate)
         bias = tensors.get("bias", excess.new_zeros(robots, members, log_posterior.shape[1], excess.shape[1]))
@@ -80,5 +81,7 @@ class OnlineState:
         h = tensors["h"].view(robots, -1, tensors["h"].shape[1])
         stored = part_of(tensors, "library.")  # which files of robots that have not changed are without
         library = Library.from_tensors(stored) if stored else None
-        belief = Belief(theta, h, log_posterior, bias, excess, candidate, diverged, adaptations, library)
+        belief = Belief(
+            theta, h, log_posterior, bias, excess, candidate, diverged, recognised, adaptations, library
+        )
         return cls(Memory(**part_of(tensors, "memory.")), belief, tensors["plan"], steps=steps, adapted_at=adapted_at)

@@ -39,7 +39,7 @@ def select(model: Dynamics, candidates: Candidates, belief: Belief, spread: bool
         likely = systematic_sample(belief.posterior, model.members, offset)  # (B, P)
     theta_meta, h_likely = model.theta_of(len(likely)), candidates.chosen(likely)
     new = replace(belief, theta=theta_meta, h=h_likely, candidate=likeliest)
-    return replace(new, adaptations=belief.adaptations + 1)
+    return replace(new, recognised=torch.zeros_like(belief.recognised), adaptations=belief.adaptations + 1)
 
 
 def gradient_steps(

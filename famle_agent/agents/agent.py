@@ -501,7 +501,8 @@ class ModelBasedAgent(MetaLearningAgent):
         """
         state = self._online.state_for(state, robot)
         error, steps = state.belief.errors[robot] / self.model.usual_error, int(state.memory.weight[robot].sum())
-        return Diagnosis.of(self.posterior(state, robot), float(error), steps)
+        recognised = bool(state.belief.recognised[robot])
+        return Diagnosis.of(self.posterior(state, robot), float(error), steps, recognised)
 
     def health(self, state: OnlineState | None = None, robot: int = 0) -> dict[str, int]:
         """Counts what was missing or late on a robot, as ``info["famle"]`` and TensorBoard do.

@@ -43,8 +43,9 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
 
     Each step's ``info["famle"]`` says what the agent believes: ``situation``, the most likely training situation;
     ``probability``, how likely it is among them; ``posterior``, all of them by name; ``adaptations``, how often the
-    agent has adapted; ``diverged``, how often its gradient steps left the finite numbers and were taken back; and what
-    was missing or late, see :meth:`~famle_agent.agents.agent.ModelBasedAgent.health`. The memory outlasts a reset, as
+    agent has adapted; ``diverged``, how often its gradient steps left the finite numbers and were taken back;
+    ``recognised``, whether the robot is as it was once before it changed; and what was missing or late, see
+    :meth:`~famle_agent.agents.agent.ModelBasedAgent.health`. The memory outlasts a reset, as
     damage does; ``agent.forget()`` empties it.
 
     An observation that cannot be a measurement, such as NaN, is passed on as it is. Give it to ``agent.predict``, which
@@ -156,5 +157,6 @@ class FAMLEWrapper(gym.Wrapper[Array, Array, Array, Array], RecordConstructorArg
             "posterior": posterior,
             "adaptations": belief.adaptations,
             "diverged": int(belief.diverged.sum()),
+            "recognised": bool(belief.recognised[0]),
             **self.agent.health(),
         }

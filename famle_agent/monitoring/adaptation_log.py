@@ -171,6 +171,7 @@ def belief_scalars(agent: LoggedAgent, state: OnlineState) -> dict[str, float]:
         **posterior,
         "adapt/adaptations": state.belief.adaptations,
         "adapt/diverged": int(state.belief.diverged.sum()),
+        "adapt/recognised": int(state.belief.recognised.sum()),
         **counts,
         "health/overruns": agent.overruns,
         "health/cut_short": agent.cut_short,

@@ -93,6 +93,19 @@ def test_what_was_learnt_of_damage_is_there_again_within_a_few_steps(
     assert seen[2] > LEARNT / 2 > seen[0]  # what it was learnt from is back too
 
 
+def test_diagnosis_says_that_a_robot_has_been_like_this_before(load: Load, tell: Tell, tmp_path: Path) -> None:
+    agent = live(load(), tell, BACK)
+    assert not agent.diagnose().recognised
+    assert "before" not in str(agent.diagnose())
+    tell(agent, range(BACK, BACK + AGAIN), [True])
+    agent.save(tmp_path / "agent.zip")
+    for one in (agent, load(tmp_path / "agent.zip")):
+        assert one.diagnose().recognised
+        assert str(one.diagnose()).endswith("The robot has been like this before.")
+    tell(agent, range(LEARNT, LEARNT + 3 * AGAIN), [False])  # and is healed again
+    assert not agent.diagnose().recognised
+
+
 def test_library_that_recognises_nothing_changes_nothing(load: Load, tell: Tell) -> None:
     with_library, without = (live(load(library_size=size), tell, BACK) for size in (2, 0))
     assert (stored(with_library), stored(without)) == (1, 0)

@@ -23,6 +23,7 @@ slow = pytest.mark.slow
 SHOWN = {
     "adapt/adaptations",
     "adapt/diverged",
+    "adapt/recognised",
     "episode/return",
     "episode/return_so_far",
     "posterior/joint 3 dead",

@@ -31,6 +31,7 @@ FAST: dict[str, Any] = {"adapt_every": 5, "adapt_steps": 2, "candidates": 4, "pl
 NUMBERS = {
     "adapt/adaptations",
     "adapt/diverged",
+    "adapt/recognised",
     "episode/return_so_far",
     "health/blind",
     "health/cut_short",
