@@ -81,7 +81,5 @@ class OnlineState:
         h = tensors["h"].view(robots, -1, tensors["h"].shape[1])
         stored = part_of(tensors, "library.")  # which files of robots that have not changed are without
         library = Library.from_tensors(stored) if stored else None
-        belief = Belief(
-            theta, h, log_posterior, bias, excess, candidate, diverged, recognised, adaptations, library
-        )
+        belief = Belief(theta, h, log_posterior, bias, excess, candidate, diverged, recognised, adaptations, library)
         return cls(Memory(**part_of(tensors, "memory.")), belief, tensors["plan"], steps=steps, adapted_at=adapted_at)

@@ -206,6 +206,7 @@ _NAMES: dict[type, dict[str, str]] = {
         "batch_size": "policy_batch_size",
         "lr": "policy_lr",
         "hidden": "policy_hidden",
+        "interaction_rank": "policy_interaction_rank",
         "discount": "discount",
         "random_steps": "policy_random_steps",
         "untold": "policy_untold",

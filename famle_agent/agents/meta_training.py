@@ -140,7 +140,7 @@ def search_policy(
     reported, (data, weights) = 0, folder.search()
     if data is not None and weights is not None and weights.exists():
         with GlobalChance(0)():  # initial weights, which are replaced
-            actor_critic = builder.actor_critic(len(envs.situations), settings.hidden)
+            actor_critic = builder.actor_critic(len(envs.situations), settings.hidden, settings.interaction_rank)
         try:
             actor_critic.load_state_dict(load_tensors(weights.read_bytes()))
         except (KeyError, RuntimeError, SafetensorError) as error:

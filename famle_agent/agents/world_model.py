@@ -152,10 +152,10 @@ class ModelBuilder:
         """Makes untrained ends of episodes."""
         return LearnedTermination(self.robot.layout).to(self.device)
 
-    def actor_critic(self, situations: int, hidden: Sequence[int]) -> ActorCritic:
+    def actor_critic(self, situations: int, hidden: Sequence[int], interaction_rank: int) -> ActorCritic:
         """Makes an untrained actor-critic for N situations."""
         sizes = self.robot.observation_space.shape[0], self.robot.action_space.shape[0], situations
-        return ActorCritic(*sizes, hidden).to(self.device)
+        return ActorCritic(*sizes, hidden, interaction_rank=interaction_rank).to(self.device)
 
     def load(self, weights: Mapping[str, dict[str, Tensor]], situations: tuple[str, ...]) -> WorldModel:
         """Makes a model of stored weights, by the names of :meth:`WorldModel.parts`.
@@ -189,7 +189,8 @@ class ModelBuilder:
             layers = {
                 int(name.split(".")[1]): len(value) for name, value in policy.items() if name.startswith("actor.")
             }
-            parts["actor_critic"] = self.actor_critic(len(situations), [layers[i] for i in sorted(layers)[:-1]])
+            hidden, rank = [layers[i] for i in sorted(layers)[:-1]], len(policy["actor_features.of_obs.weight"])
+            parts["actor_critic"] = self.actor_critic(len(situations), hidden, rank)
         return parts
 
     @property

@@ -20,13 +20,14 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from famle_agent.data import gate
 from famle_agent.data.transitions import EnvSource, Transitions
 from famle_agent.data.watch import Watch
-from famle_agent.models.actor_critic import ActorCritic
+from famle_agent.models.actor_critic import ActorCritic, Features
 from famle_agent.utils.chance import GlobalChance
 
 __all__ = ["PolicySearch", "Search"]
@@ -45,6 +46,7 @@ class PolicySearch:
         batch_size: Transitions per gradient step.
         lr: Rate of actor and critics.
         hidden: Width of each of their hidden layers.
+        interaction_rank: Products of the observation and the situation that they see.
         discount: gamma.
         random_steps: Steps of each situation at the beginning, whose actions are random.
         untold: Part of each batch in which the situation is not told, so that there is something to do before it is.
@@ -55,6 +57,7 @@ class PolicySearch:
     batch_size: int = 128
     lr: float = 1e-3
     hidden: tuple[int, ...] = (192, 192)
+    interaction_rank: int = 36
     discount: float = 0.99
     random_steps: int = 800
     untold: float = 0.1
@@ -63,6 +66,8 @@ class PolicySearch:
         object.__setattr__(self, "hidden", tuple(int(width) for width in self.hidden))
         if not self.hidden or min(self.hidden) < 1:
             raise ValueError(f"policy_hidden must name the width of at least one layer, got {self.hidden}.")
+        if self.interaction_rank < 1:
+            raise ValueError(f"policy_interaction_rank must be at least 1, got {self.interaction_rank!r}.")
         if self.untold > 1.0:
             raise ValueError(f"policy_untold is a part of each batch, at most 1, got {self.untold!r}.")
         if not 0.0 < self.discount < 1.0:
@@ -118,6 +123,7 @@ class Search:
             running.count = 0.0  # without a first guess of mean and variance, which would be one of units
         self.chance = GlobalChance(seed)
         train_every = max(1, 50 // n)
+        features = {"obs_dim": self._obs_dim, "n_situations": n, "rank": settings.interaction_rank}
         with self.chance(), _float32():
             self.sac = SAC(
                 "MlpPolicy",
@@ -131,7 +137,11 @@ class Search:
                 gamma=settings.discount,
                 replay_buffer_class=_PartlyUntold,
                 replay_buffer_kwargs={"untold": settings.untold, "n_situations": n},
-                policy_kwargs={"net_arch": list(settings.hidden)},
+                policy_kwargs={
+                    "net_arch": list(settings.hidden),
+                    "features_extractor_class": _Features,
+                    "features_extractor_kwargs": features,
+                },
                 device="cpu",
             )
             self._envs.action_space.seed(seed)
@@ -173,11 +183,15 @@ class Search:
         """Returns what was learnt."""
         sac, scale, n = self.sac, self._envs, len(self._situations)
         with self.chance():
-            made = ActorCritic(self._obs_dim, self.action_space.shape[0], n, self._settings.hidden)
-        learnt = [*sac.actor.latent_pi.parameters(), *sac.actor.mu.parameters(), *sac.critic.parameters()]
+            sizes = self._obs_dim, self.action_space.shape[0], n
+            rank = self._settings.interaction_rank
+            made = ActorCritic(*sizes, self._settings.hidden, interaction_rank=rank)
+        actor = sac.actor.features_extractor, sac.actor.latent_pi, sac.actor.mu
+        learnt = [weights for part in (*actor, sac.critic) for weights in part.parameters()]
+        ours = made.actor_features, made.actor, made.critic_features, made.critics
         obs_rms: Any = scale.obs_rms
         with torch.no_grad():
-            for mine, theirs in zip([*made.actor.parameters(), *made.critics.parameters()], learnt, strict=True):
+            for mine, theirs in zip((weights for part in ours for weights in part.parameters()), learnt, strict=True):
                 mine.copy_(theirs)
             made.mean.copy_(torch.as_tensor(obs_rms.mean))
             # What never varied was 0 for the networks, and must not be blown up where it does.
@@ -217,6 +231,20 @@ class _Told(gym.Wrapper[Any, Any, Any, Any]):
 
     def _tell(self, obs: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
         return np.concatenate([obs.astype(np.float32), self._told])
+
+
+class _Features(BaseFeaturesExtractor):
+    """Lets the library's networks see products of the observation and the situation."""
+
+    def __init__(self, observation_space: spaces.Box, **sizes: int) -> None:
+        features = Features(**sizes)
+        super().__init__(observation_space, features.size)
+        self.features = features
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """See :meth:`torch.nn.Module.forward`."""
+        seen: torch.Tensor = self.features(observations)
+        return seen
 
 
 class _PartlyUntold(ReplayBuffer):
