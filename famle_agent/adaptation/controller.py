@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol
 
 import torch
@@ -18,7 +19,7 @@ from famle_agent.adaptation.memory import Memory
 from famle_agent.adaptation.state import OnlineState
 from famle_agent.models.reward import Objective
 from famle_agent.models.simulator import Simulator
-from famle_agent.planning import Planner, shift
+from famle_agent.planning import Judge, Planner, shift
 from famle_agent.utils.deadline import Deadline
 
 __all__ = ["Adapter", "Controller"]
@@ -130,14 +131,14 @@ class Controller:
         """Plans an action in [-1, 1], (B, action_dim), with the adapted model (line 4) and by the deadline, if any."""
         state = self.reset(state, starts)
         model = self.adapter.model_for(state.belief, state.memory)
-        objective, proposals = self.objective, None
+        judge: Judge = partial(model.returns, self.objective, obs)
+        proposals = None
         if self.guide is not None:
             likely = self.adapter.likely(state.belief)
             proposals = self.guide.proposals(model, obs, likely, self.planner.horizon, generator)
-            objective = self.guide.looking_beyond(objective, likely, model)
-        action, plan = self.planner.plan(
-            lambda tau: model.returns(objective, obs, tau), state.plan, generator, proposals, deadline
-        )
+            objective = self.guide.looking_beyond(self.objective, likely, model)
+            judge = self.guide.judge(objective, model, obs, proposals[:, :1])
+        action, plan = self.planner.plan(judge, state.plan, generator, proposals, deadline)
         return action, replace(state, plan=shift(plan), last=(obs, action))
 
     def reset(self, state: OnlineState, starts: Tensor) -> OnlineState:

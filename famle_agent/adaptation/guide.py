@@ -1,4 +1,4 @@
-"""What a policy learnt in simulation tells the planner (line 4): plans to begin with, and values beyond their end."""
+"""What a policy learnt in simulation tells the planner (line 4): plans to begin with and to beat, and far sight."""
 
 from __future__ import annotations
 
@@ -10,29 +10,32 @@ from torch import Tensor
 from famle_agent.models.actor_critic import ActorCritic
 from famle_agent.models.reward import Objective
 from famle_agent.models.simulator import Simulator
-from famle_agent.planning import coloured_noise
+from famle_agent.planning import Judge, coloured_noise
 
 __all__ = ["Guide"]
 
 
 @dataclass(frozen=True)
 class Guide:
-    """Proposes what the actor would do in each likely situation, and values where a plan ends.
+    """Proposes what the actor would do in each likely situation, values where a plan ends, and judges plans.
 
     What the actor would do in another situation than the most likely one is often better where nothing like the robot
-    was trained; the planner judges all of it by the adapted model.
+    was trained; the planner judges all of it by the adapted model. A planner finds what a model is wrong about. So a
+    plan counts by how much better it is than what the actor would do that is told nothing, and by how sure that is.
 
     Attributes:
         actor_critic: Learnt in simulation.
         situations: The most likely situations whose actor proposes, beside the one that is told nothing.
         noise: Deviation of a second proposal around each.
         noise_beta: Exponent of its spectrum.
+        caution: kappa, deviations among the members of the ensemble that an advantage is lowered by.
     """
 
     actor_critic: ActorCritic
     situations: int = 10
     noise: float = 0.3
     noise_beta: float = 2.0
+    caution: float = 1.0
 
     def proposals(
         self, model: Simulator, obs: Tensor, likely: Tensor, horizon: int, generator: torch.Generator
@@ -80,3 +83,28 @@ class Guide:
             return values.mean(dim=0)
 
         return replace(objective, value_fn=value, discount=float(self.actor_critic.discount))
+
+    def judge(self, objective: Objective, model: Simulator, obs: Tensor, untold: Tensor) -> Judge:
+        """Judges a plan tau by a lower bound of its advantage over the actor that is told nothing, pi.
+
+        With J_m the return in member m of the ensemble,
+
+            d_m(tau) = J_m(tau) - J_m(pi),    judge(tau) = mean_m d_m(tau) - kappa std_m d_m(tau).
+
+        So pi has 0, and goes on where no plan is surely better. What all plans are wrong about alike cancels out.
+
+        Args:
+            objective: What counts.
+            model: The adapted dynamics of B robots.
+            obs: Where they are, (B, obs_dim).
+            untold: pi, the first of the :meth:`proposals`, (B, 1, H, action_dim).
+        """
+        of_policy = model.returns_of_members(objective, obs, untold)  # (B, P, 1)
+        of_policy = torch.where(of_policy.isfinite(), of_policy, 0.0)
+
+        def judged(tau: Tensor) -> Tensor:
+            advantage = model.returns_of_members(objective, obs, tau) - of_policy  # (B, P, N)
+            bound = advantage.mean(dim=1) - self.caution * advantage.std(dim=1, correction=0)
+            return bound.nan_to_num(nan=-torch.inf, neginf=-torch.inf)
+
+        return judged

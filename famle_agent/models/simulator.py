@@ -103,8 +103,11 @@ class Simulator:
             obs: Where the robots are, (B, obs_dim).
             actions: Candidates in [-1, 1], (B, N, H, action_dim).
         """
-        of_members = imagine(self._step, objective, self.rows(obs[:, None]), self.rows(actions[:, None]))  # (B * P, N)
-        return self.of_robots(of_members).mean(dim=1)
+        return self.returns_of_members(objective, obs, actions).mean(dim=1)
+
+    def returns_of_members(self, objective: Objective, obs: Tensor, actions: Tensor) -> Tensor:
+        """Computes the same in each member of the ensemble, (B, P, N); arguments as of :meth:`returns`."""
+        return self.of_robots(imagine(self._step, objective, self.rows(obs[:, None]), self.rows(actions[:, None])))
 
     def _step(self, obs: Tensor, action: Tensor) -> Tensor:
         """Predicts the next observations from a row for each member of each robot, (B * P, n, ...)."""

@@ -53,6 +53,30 @@ def test_value_of_the_most_likely_situation_and_of_none_lies_beyond_a_plan() -> 
     torch.testing.assert_close(found, (after[..., 0] + 0.5 * values).mean(dim=1), rtol=1e-4, atol=1e-5)
 
 
+@torch.no_grad()
+def test_plan_is_judged_by_a_lower_bound_of_its_advantage_over_the_policy() -> None:
+    guide, model, obs = made()
+    objective = Objective(lambda s, a, s_next: s_next[..., 0])
+    plans, policy = torch.rand(2, 4, 3, 1) * 2.0 - 1.0, torch.rand(2, 1, 3, 1) * 2.0 - 1.0
+    judge = guide.judge(objective, model, obs, policy)
+    torch.testing.assert_close(judge(policy), torch.zeros(2, 1))
+    first, second = (model.returns_of_members(objective, obs, tau) for tau in (plans, policy))  # (2, 2, N)
+    advantage = first - second
+    of_two = 0.5 * (advantage[:, 0] + advantage[:, 1]) - 0.5 * (advantage[:, 0] - advantage[:, 1]).abs()
+    torch.testing.assert_close(judge(plans), of_two, rtol=1e-4, atol=1e-5)  # of two members that is the smaller one
+
+
+@torch.no_grad()
+def test_plan_that_leaves_the_finite_numbers_is_never_better_than_the_policy() -> None:
+    guide, model, obs = made()
+    wild = Objective(lambda s, a, s_next: torch.where(a[..., 0] > 0.5, torch.inf, a[..., 0]))
+    plans = torch.tensor([-0.5, 0.9, 0.4])[None, :, None, None].expand(2, -1, 3, -1)
+    for policy in (-0.5, 0.9):  # and where the policy itself leaves them, a finite plan is better than none
+        found = guide.judge(wild, model, obs, torch.full((2, 1, 3, 1), policy))(plans)
+        assert found.argmax(dim=1).tolist() == [2, 2]
+        assert (found[:, 1] == -torch.inf).all()
+
+
 def test_nothing_counts_behind_the_end_of_an_episode() -> None:
     _, model, obs = made(robots=1)
     actions = torch.zeros(1, 1, 5, 1)
