@@ -263,8 +263,8 @@ class StoredAgent(BaseAlgorithm):
         except (LookupError, RuntimeError, TypeError, ValueError) as error:
             policy.world, self._online.state = known  # nothing is half-taken
             raise ValueError(
-                "The file's weights do not fit its settings; it is damaged, of an older version, or an override changed "
-                f"the network: {error}"
+                "The file's weights do not fit its settings; it is damaged, of an older version, or an override "
+                f"changed the network: {error}"
             ) from error
 
     def _differs(self, env: dict[str, Any] | None) -> list[str]:
