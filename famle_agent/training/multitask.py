@@ -53,7 +53,7 @@ class JointTraining:
             {"params": list(model.theta.values()), "lr": self.lr},
             {"params": [model.embeddings], "lr": self.embedding_lr},
         ]
-        optimizer = torch.optim.Adam(groups, fused=True)
+        optimizer = torch.optim.Adam(groups, foreach=True)  # a fused one does not count the changes of a tensor
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimizer, lambda done: min(1.0, 2.0 * (1.0 - done / max(1, self.iterations)))
         )
