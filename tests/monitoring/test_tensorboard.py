@@ -114,10 +114,11 @@ def test_picture_of_returns(tmp_path: Path) -> None:
 def test_calls_leave_no_thread_behind(quick_agent: FAMLE, tmp_path: Path) -> None:
     quick_agent.tensorboard_log = str(tmp_path)
     quick_agent.learn(2)
+    gc.collect()
     threads = threading.active_count()
     for _ in range(3):
         quick_agent.learn(2)
-    assert threading.active_count() == threads
+    assert threading.active_count() <= threads  # those of other tests may end meanwhile
     assert len(list(tmp_path.rglob("events.*"))) == 4
 
 
