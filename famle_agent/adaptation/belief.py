@@ -123,8 +123,8 @@ def unadapted(model: Dynamics, log_prior: Tensor, robots: int) -> Belief:
     none = torch.zeros(robots, dtype=torch.long, device=model.embeddings.device)
     bias = log_prior.new_zeros(robots, model.members, len(log_prior), model.obs_dim)
     theta, h, excess = model.theta_of(robots), model.embeddings_of(none), bias.new_ones(robots, model.obs_dim)
-    log_posterior = log_prior.expand(robots, -1)
-    return Belief(theta, h, log_posterior, bias, excess, candidate=none, diverged=none, recognised=none > 0)
+    log_posterior, recognised = log_prior.expand(robots, -1), torch.zeros_like(none, dtype=torch.bool)
+    return Belief(theta, h, log_posterior, bias, excess, candidate=none, diverged=none, recognised=recognised)
 
 
 def choose(kept: Tensor, mine: Tensor, theirs: Tensor) -> Tensor:

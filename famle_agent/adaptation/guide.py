@@ -91,7 +91,8 @@ class Guide:
 
             d_m(tau) = J_m(tau) - J_m(pi),    judge(tau) = mean_m d_m(tau) - kappa std_m d_m(tau).
 
-        So pi has 0, and goes on where no plan is surely better. What all plans are wrong about alike cancels out.
+        So pi has 0, and goes on where no plan is surely better. What all plans are wrong about alike cancels out. In a
+        member that pi leads out of the finite numbers there is nothing to be better than, and J_m(tau) counts.
 
         Args:
             objective: What counts.

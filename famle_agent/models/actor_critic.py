@@ -74,7 +74,8 @@ class ActorCritic(nn.Module):
         super().__init__()
         self.obs_dim, self.n_situations = obs_dim, n_situations
         inputs = obs_dim + n_situations
-        self.actor_features, self.critic_features = (Features(obs_dim, n_situations, interaction_rank) for _ in "ac")
+        self.actor_features = Features(obs_dim, n_situations, interaction_rank)
+        self.critic_features = Features(obs_dim, n_situations, interaction_rank)
         seen = self.actor_features.size
         self.actor = mlp([seen, *hidden, action_dim])
         self.critics = nn.ModuleList(mlp([seen + action_dim, *hidden, 1]) for _ in range(critics))

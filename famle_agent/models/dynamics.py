@@ -43,7 +43,7 @@ class Batch:
         c, i = index
         row = c * self.weight.shape[1] + i
 
-        def taken(values: Tensor) -> Tensor:  # a third of the time of values[c, i]
+        def taken(values: Tensor) -> Tensor:  # faster than values[c, i]
             return values.flatten(0, 1).index_select(0, row.flatten()).view(*row.shape, *values.shape[2:])
 
         return Batch(taken(self.x), taken(self.y), taken(self.weight))

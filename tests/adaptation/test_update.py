@@ -177,8 +177,8 @@ def make_belief(value: float, adaptations: int, members: int = 1) -> Belief:
     h, log_posterior, candidate = torch.full((*axes, 4), value), torch.full((3, 5), value), torch.full((3,), int(value))
     excess = torch.full((3, 2), value)
     bias = excess[:, None, None].expand(-1, members, log_posterior.shape[1], -1)
-    never = torch.zeros_like(candidate)
-    return Belief(theta, h, log_posterior, bias, excess, candidate, never, never > 0, adaptations)
+    diverged, recognised = torch.zeros_like(candidate), torch.zeros_like(candidate, dtype=torch.bool)
+    return Belief(theta, h, log_posterior, bias, excess, candidate, diverged, recognised, adaptations)
 
 
 @given(st.lists(st.booleans(), min_size=3, max_size=3), st.integers(1, 3))

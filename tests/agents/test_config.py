@@ -259,7 +259,14 @@ def test_rounds_without_joint_training_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("policy_hidden", ()), ("policy_hidden", (8, 0)), ("policy_untold", 1.5), ("discount", 1.0)]
+    ("name", "value"),
+    [
+        ("policy_hidden", ()),
+        ("policy_hidden", (8, 0)),
+        ("policy_interaction_rank", 0),
+        ("policy_untold", 1.5),
+        ("discount", 1.0),
+    ],
 )
 def test_policy_out_of_range_is_refused(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=name):

@@ -16,8 +16,8 @@ def test_what_a_situation_does_to_an_observation_is_linear_in_the_features(
 ) -> None:
     """So that a situation's features are the weighted sum of others' where it is told as their sum."""
     torch.manual_seed(seed)
-    features, s = Features(obs_dim, n, rank), torch.randn(3, obs_dim)
-    first, second = torch.randn(2, 3, n)
+    features, s = Features(obs_dim, n, rank).double(), torch.randn(3, obs_dim, dtype=torch.float64)
+    first, second = torch.randn(2, 3, n, dtype=torch.float64)
 
     def products(c: torch.Tensor) -> torch.Tensor:
         seen: torch.Tensor = features(torch.cat([s, c], dim=-1))
@@ -26,8 +26,8 @@ def test_what_a_situation_does_to_an_observation_is_linear_in_the_features(
         return seen[:, obs_dim + n :]
 
     expected = products(first) + 2.0 * products(second)
-    torch.testing.assert_close(products(first + 2.0 * second), expected, rtol=1e-4, atol=1e-5)
-    assert not products(torch.zeros(3, n)).any()  # nothing is told
+    torch.testing.assert_close(products(first + 2.0 * second), expected)
+    assert not products(torch.zeros_like(first)).any()  # nothing is told
 
 
 def test_actor_that_is_told_nothing_acts_as_without_products() -> None:

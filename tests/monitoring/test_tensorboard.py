@@ -113,12 +113,12 @@ def test_picture_of_returns(tmp_path: Path) -> None:
 
 def test_calls_leave_no_thread_behind(quick_agent: FAMLE, tmp_path: Path) -> None:
     quick_agent.tensorboard_log = str(tmp_path)
+    others = set(threading.enumerate())  # which may end meanwhile
     quick_agent.learn(2)
-    gc.collect()
-    threads = threading.active_count()
+    of_one = len(set(threading.enumerate()) - others)
     for _ in range(3):
         quick_agent.learn(2)
-    assert threading.active_count() <= threads  # those of other tests may end meanwhile
+    assert len(set(threading.enumerate()) - others) == of_one
     assert len(list(tmp_path.rglob("events.*"))) == 4
 
 
