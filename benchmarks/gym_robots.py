@@ -242,12 +242,17 @@ def cached_at(method: str, name: str, seed: int, cache: Path, change: tuple[str,
     return cache / f"gym-{'-'.join((name, kind_of(method).__name__, *change))}-{seed}.zip"
 
 
+def settings_of(change: tuple[str, ...]) -> dict[str, Any]:
+    """Reads settings that are to be changed, as ``"policy_steps=100000"``."""
+    return {key: json.loads(value) for key, _, value in (one.partition("=") for one in change)}
+
+
 def agent_of(method: str, name: str, seed: int, cache: Path, change: tuple[str, ...]) -> ModelBasedAgent:
     """Makes an agent with nothing changed but what its name says; what it meta-learns is kept."""
     train = BEDS[name]().train
     make = kind_of(method)
-    settings = {key: json.loads(value) for key, _, value in (one.partition("=") for one in change)}
-    agent = make(train["intact"](), seed=seed, device="cpu", **(settings if make is FAMLE else {}))
+    settings = settings_of(change) if make is FAMLE else {}
+    agent = make(train["intact"](), seed=seed, device="cpu", **settings)
     path = cached_at(method, name, seed, cache, change)
     agent = from_cache(agent, path, lambda agent: agent.meta_learn(train))
     if method == "famle-frozen":
@@ -268,7 +273,7 @@ def actor_of(method: str, name: str, seed: int, cache: Path, change: tuple[str, 
         return Nothing() if method == "nothing" else Actor()
     if method in MODEL_FREE:
         train = BEDS[name]().train
-        settings = FAMLE(train["intact"]()).config.simulation.policy or PolicySearch()
+        settings = FAMLE(train["intact"](), **settings_of(change)).config.simulation.policy or PolicySearch()
         return Learnt(MODEL_FREE[method].learn(train, settings, seed))
     agent = agent_of(method, name, seed, cache, change)
     if method != "famle-actor":
