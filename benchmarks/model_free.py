@@ -71,7 +71,7 @@ def as_policy(actor_critic: ActorCritic, space: spaces.Box) -> Policy:
     @torch.no_grad()
     def act(obs: Any) -> Any:
         numbers = torch.as_tensor(np.asarray(obs), dtype=torch.float32)
-        return to_action_space(actor_critic.act(numbers, torch.tensor(-1)), space)
+        return to_action_space(actor_critic.act(numbers, actor_critic.untold), space)
 
     return act
 

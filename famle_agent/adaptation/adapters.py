@@ -117,6 +117,10 @@ class EmbeddingAdapter:
         """Sums the posterior over what each training situation is a part of, (B, N)."""
         return self.candidates.marginal(belief.posterior)
 
+    def likeliest(self, belief: Belief) -> Tensor:
+        """Says how much of each training situation the most likely candidate is, (B, N)."""
+        return self.candidates.shares[belief.log_posterior.argmax(dim=1)]
+
     def posterior(self, belief: Belief, situations: Sequence[str]) -> dict[str, float]:
         """Names each candidate, ``"a + b"`` where faults are composed, and says how likely it is."""
         return dict(zip(self.candidates.names(situations), belief.posterior[0].tolist(), strict=True))
@@ -229,6 +233,10 @@ class GradientAdapter:
     def likely(self, belief: Belief) -> Tensor:
         """Returns ones, (B, 1): there is nothing to tell apart."""
         return torch.ones_like(belief.log_posterior)
+
+    def likeliest(self, belief: Belief) -> Tensor:
+        """Returns ones, (B, 1), as :meth:`likely`."""
+        return self.likely(belief)
 
     def posterior(self, belief: Belief, situations: Sequence[str]) -> dict[str, float]:
         """Puts all the probability on the one model that there is."""

@@ -54,12 +54,15 @@ class Candidates:
         kind = self.h.new_tensor(_KINDS) / faults.bincount()
         return kind[faults].log().log_softmax(dim=0)
 
+    @cached_property
+    def shares(self) -> Tensor:
+        """How much of each training situation each is, (C, N): e_i, or e_i + e_j - e_0."""
+        unit = torch.eye(int((self.pairs[:, 1] == 0).sum()), dtype=self.h.dtype, device=self.h.device)
+        return unit[self.pairs[:, 0]] + unit[self.pairs[:, 1]] - unit[0]
+
     def marginal(self, posterior: Tensor) -> Tensor:
         """Computes how likely each training situation is, alone or as a part: (B, C) -> (B, N)."""
-        n = int((self.pairs[:, 1] == 0).sum())
-        total = posterior.clone()[:, :n]
-        both, (i, j) = posterior[:, n:], self.pairs[n:].T
-        return total.index_add(1, i, both).index_add(1, j, both)
+        return posterior @ (self.shares > 0.0).to(posterior.dtype)
 
     def names(self, situations: Sequence[str]) -> list[str]:
         """Names the candidates, given the names of the training situations."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from famle_agent.models.actor_critic import ActorCritic
 from famle_agent.models.reward import Objective
@@ -25,6 +27,7 @@ class Guide:
 
     Attributes:
         actor_critic: Learnt in simulation.
+        idle: The action that does nothing, (action_dim,).
         situations: The most likely situations whose actor proposes, beside the one that is told nothing.
         noise: Deviation of a second proposal around each.
         noise_beta: Exponent of its spectrum.
@@ -32,6 +35,7 @@ class Guide:
     """
 
     actor_critic: ActorCritic
+    idle: Tensor
     situations: int = 10
     noise: float = 0.3
     noise_beta: float = 2.0
@@ -40,7 +44,9 @@ class Guide:
     def proposals(
         self, model: Simulator, obs: Tensor, likely: Tensor, horizon: int, generator: torch.Generator
     ) -> Tensor:
-        """Rolls the actor through the adapted model, (B, 2 M, H, action_dim) for M situations.
+        """Rolls the actor through the adapted model, (B, 2 M + 1, H, action_dim) for M situations.
+
+        The last plan does nothing, so that a robot is not moved to its harm.
 
         Args:
             model: The adapted dynamics of B robots.
@@ -50,9 +56,10 @@ class Guide:
             generator: Source of all the chance.
         """
         most = likely.topk(min(self.situations, likely.shape[1]), dim=1).indices
-        told = torch.cat([torch.full_like(most[:, :1], -1), most], dim=1)  # (B, M)
-        told = torch.cat([told, told], dim=1)  # (B, 2 M): as it is, and with noise
-        B, rows = told.shape
+        untold = self.actor_critic.untold
+        told = torch.cat([untold.expand(len(most), 1, -1), one_hot(most, len(untold))], dim=1)  # (B, M, N)
+        told = torch.cat([told, told], dim=1)  # (B, 2 M, N): as it is, and with noise
+        B, rows, _ = told.shape
         like = obs.new_zeros(B, horizon, model.action_dim)
         noise = self.noise * coloured_noise(like, rows // 2, self.noise_beta, generator)
         noise = torch.cat([torch.zeros_like(noise), noise], dim=1)  # (B, 2 M, H, action_dim)
@@ -63,25 +70,19 @@ class Guide:
             actions.append((self.actor_critic.act(state, told) + noise[:, :, t]).nan_to_num(0.0).clamp(-1.0, 1.0))
             if t + 1 < horizon:
                 state = model(state, actions[-1]).mean(dim=1)  # of the ensemble
-        return torch.stack(actions, dim=2)
+        idle = self.idle.expand(B, 1, horizon, -1)
+        return torch.cat([torch.stack(actions, dim=2), idle], dim=1)
 
-    def looking_beyond(self, objective: Objective, likely: Tensor, model: Simulator) -> Objective:
-        """Adds the critics' value of where a plan ends: the mean of the most likely situation's and of none's.
-
-        Where nothing like the robot was trained, the value of a situation is too high where its own policy does not go.
+    def looking_beyond(self, objective: Objective, likeliest: Tensor, model: Simulator) -> Objective:
+        """Adds the critics' value of where a plan ends.
 
         Args:
             objective: What counts until then.
-            likely: How likely each training situation is, (B, N).
+            likeliest: What is most likely the case, as shares of the training situations, (B, N).
             model: The adapted dynamics of B robots.
         """
-        likeliest = model.rows(likely.argmax(dim=1)[:, None])
-        told = torch.stack([likeliest, torch.full_like(likeliest, -1)])[..., None]  # (2, B * P, 1)
-
-        def value(obs: Tensor) -> Tensor:
-            values = self.actor_critic.value(obs.expand(2, *obs.shape), told.expand(2, *obs.shape[:2]))
-            return values.mean(dim=0)
-
+        told = model.rows(likeliest[:, None, None])  # (B * P, 1, N)
+        value = partial(self.actor_critic.value, told=told)
         return replace(objective, value_fn=value, discount=float(self.actor_critic.discount))
 
     def judge(self, objective: Objective, model: Simulator, obs: Tensor, untold: Tensor) -> Judge:

@@ -128,7 +128,7 @@ class AdaptivePolicy:
         if world is not None and objective.termination_fn is None:
             objective = replace(objective, termination_fn=world.termination)
         if world is not None and world.actor_critic is not None:
-            guide = Guide(world.actor_critic)
+            guide = Guide(world.actor_critic, self.idle_action)
         when = how.every, how.at_reset, how.forget_at_reset
         return Controller(adapter, self.config.planner, objective, *when, guide)
 

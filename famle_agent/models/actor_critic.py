@@ -39,10 +39,9 @@ class Features(nn.Module):
 
 
 class ActorCritic(nn.Module):
-    """An actor and critics that are told the situation as a one-hot vector, and see :class:`Features` of both.
+    """An actor and critics that are told how much of each situation it is, and see :class:`Features` of both.
 
-    A situation index of -1 is a robot whose situation is not told. Inputs are normalised, one-hot vectors included, so
-    that 0 is the mean of all situations; this is what is put in for those that are not told.
+    In training that is a one-hot vector c = e_i. Two faults at once are c = e_i + e_j - e_0, as of embeddings.
 
     Args:
         obs_dim: Number of observation dimensions.
@@ -53,6 +52,8 @@ class ActorCritic(nn.Module):
         interaction_rank: Products of observation and situation that the actor sees, and others that the critics see.
 
     Attributes:
+        mean: Of what is put in, observation and c; inputs are normalised.
+        std: Its deviation.
         value_scale: What the critics' values are to be multiplied by to be sums of rewards.
         discount: gamma of these sums.
     """
@@ -84,13 +85,18 @@ class ActorCritic(nn.Module):
         self.register_buffer("value_scale", torch.ones((), dtype=torch.float32))
         self.register_buffer("discount", torch.ones((), dtype=torch.float32))
 
-    def act(self, obs: Tensor, situation: Tensor) -> Tensor:
-        """Returns the actor's mean action in [-1, 1], (..., action_dim), for (..., obs_dim) in situations (...)."""
-        return self._act(self._inputs(obs, situation))
+    @property
+    def untold(self) -> Tensor:
+        """What is told of a robot whose situation is not known, (N,): the mean of all, so that 0 is put in."""
+        return self.mean[self.obs_dim :]
 
-    def value(self, obs: Tensor, situation: Tensor) -> Tensor:
+    def act(self, obs: Tensor, told: Tensor) -> Tensor:
+        """Returns the actor's mean action in [-1, 1], (..., action_dim), for (..., obs_dim) and c, (..., N)."""
+        return self._act(self._inputs(obs, told))
+
+    def value(self, obs: Tensor, told: Tensor) -> Tensor:
         """Returns the discounted sum of rewards that the actor expects from here on, (...): a mean of the critics."""
-        x = self._inputs(obs, situation)
+        x = self._inputs(obs, told)
         x = torch.cat([self.critic_features(x), self._act(x)], dim=-1)
         values = torch.stack([critic(x)[..., 0] for critic in self.critics])
         return values.mean(dim=0) * self.value_scale
@@ -99,13 +105,9 @@ class ActorCritic(nn.Module):
         action: Tensor = self.actor(self.actor_features(x))
         return action.tanh()
 
-    def _inputs(self, obs: Tensor, situation: Tensor) -> Tensor:
-        mean, std = self.mean, self.std
-        seen = ((obs - mean[: self.obs_dim]) / std[: self.obs_dim]).clamp(-_FAR, _FAR)
-        told = nn.functional.one_hot(situation.clamp(min=0), self.n_situations).to(obs.dtype)
-        told = ((told - mean[self.obs_dim :]) / std[self.obs_dim :]).clamp(-_FAR, _FAR)
-        told = torch.where(situation[..., None] < 0, 0.0, told)
-        return torch.cat([seen, told.expand(*seen.shape[:-1], -1)], dim=-1)
+    def _inputs(self, obs: Tensor, told: Tensor) -> Tensor:
+        x = torch.cat([obs, told.expand(*obs.shape[:-1], -1)], dim=-1)
+        return ((x - self.mean) / self.std).clamp(-_FAR, _FAR)
 
 
 def mlp(sizes: Sequence[int]) -> nn.Sequential:

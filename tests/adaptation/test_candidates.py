@@ -34,6 +34,8 @@ def test_candidates_are_situations_and_sums_of_two(n: int, compose: bool, member
     assert candidates.h.shape == (1, members, len(pairs), model.embeddings.shape[-1])
     assert not candidates.h.requires_grad
     assert torch.allclose(candidates.h[0, :, :n], H, atol=1e-6)
+    together = torch.einsum("cn,pne->pce", candidates.shares, H)
+    torch.testing.assert_close(candidates.h[0], together)
     for number, (i, j) in enumerate(pairs):
         torch.testing.assert_close(candidates.h[0, :, number], (H[:, i] + H[:, j] - H[:, 0]).detach())
 

@@ -13,7 +13,7 @@ from famle_agent.models.simulator import Simulator
 def made(n: int = 3, robots: int = 2) -> tuple[Guide, Simulator, Tensor]:
     torch.manual_seed(0)
     model = Dynamics(2, 1, n_situations=n, embedding_dim=2, hidden=(6,), members=2)
-    guide = Guide(ActorCritic(2, 1, n, hidden=(5,)).requires_grad_(False), situations=2)
+    guide = Guide(ActorCritic(2, 1, n, hidden=(5,)).requires_grad_(False), torch.tensor([0.25]), situations=2)
     return guide, Simulator(model, model.embeddings_of(torch.zeros(robots, dtype=torch.long))), torch.randn(robots, 2)
 
 
@@ -22,34 +22,31 @@ def test_proposals_are_what_the_actor_would_do_in_the_likely_situations() -> Non
     guide, model, obs = made()
     likely = torch.tensor([[0.1, 0.2, 0.7], [0.6, 0.1, 0.3]])
     proposals = guide.proposals(model, obs, likely, 4, torch.Generator().manual_seed(0))
-    assert proposals.shape == (2, 6, 4, 1)  # nothing told and two situations, each as it is and with noise
-    for robot, situations in enumerate(((-1, 2, 1), (-1, 0, 2))):
-        expected = guide.actor_critic.act(obs[robot].expand(3, -1), torch.tensor(situations))
+    assert proposals.shape == (2, 7, 4, 1)  # nothing told and two situations, each as it is and with noise; no action
+    assert (proposals[:, 6] == 0.25).all()
+    for robot, situations in enumerate(((2, 1), (0, 2))):
+        told = torch.stack([guide.actor_critic.untold, *torch.eye(3)[list(situations)]])
+        expected = guide.actor_critic.act(obs[robot].expand(3, -1), told)
         torch.testing.assert_close(proposals[robot, :3, 0], expected)
         state = obs[[robot, robot]]
         for t in range(4):  # one robot, one situation, by hand
-            action = guide.actor_critic.act(state[robot : robot + 1], torch.tensor([situations[1]]))
+            action = guide.actor_critic.act(state[robot : robot + 1], told[1])
             torch.testing.assert_close(proposals[robot, 1, t], action[0])
             state = model(state[:, None], action.expand(2, -1)[:, None]).mean(dim=1)[:, 0]
-    assert (proposals[:, 3:] != proposals[:, :3]).any(dim=-1).all()
+    assert (proposals[:, 3:6] != proposals[:, :3]).any(dim=-1).all()
     assert proposals.abs().max() <= 1.0
 
 
 @torch.no_grad()
-def test_value_of_the_most_likely_situation_and_of_none_lies_beyond_a_plan() -> None:
+def test_value_of_what_is_most_likely_lies_beyond_a_plan() -> None:
     guide, model, obs = made()
     guide.actor_critic.discount.fill_(0.5)
-    likely = torch.tensor([[0.1, 0.2, 0.7], [0.6, 0.1, 0.3]])
-    objective = guide.looking_beyond(Objective(lambda s, a, s_next: s_next[..., 0]), likely, model)
-    actions, untold = torch.randn(2, 3, 1, 1).clamp(-1.0, 1.0), torch.tensor(-1)
+    likeliest = torch.tensor([[-1.0, 1.0, 1.0], [0.0, 0.0, 1.0]])  # a sum of two, and one alone
+    objective = guide.looking_beyond(Objective(lambda s, a, s_next: s_next[..., 0]), likeliest, model)
+    actions = torch.randn(2, 3, 1, 1).clamp(-1.0, 1.0)
     found = model.returns(objective, obs, actions)
     after = model(obs[:, None].expand(-1, 3, -1), actions[:, :, 0])  # (2, P, 3, obs_dim)
-    values = torch.stack(
-        [
-            0.5 * (guide.actor_critic.value(after[i], torch.tensor(c)) + guide.actor_critic.value(after[i], untold))
-            for i, c in enumerate((2, 0))
-        ]
-    )
+    values = torch.stack([guide.actor_critic.value(after[i], told) for i, told in enumerate(likeliest)])
     torch.testing.assert_close(found, (after[..., 0] + 0.5 * values).mean(dim=1), rtol=1e-4, atol=1e-5)
 
 

@@ -32,12 +32,13 @@ def test_what_a_situation_does_to_an_observation_is_linear_in_the_features(
 
 def test_actor_that_is_told_nothing_acts_as_without_products() -> None:
     torch.manual_seed(0)
-    ours, obs, untold = ActorCritic(3, 2, 4, hidden=(8,)), torch.randn(5, 3), torch.full((5,), -1)
-    before = ours.act(obs, untold), ours.value(obs, untold)
-    told = ours.act(obs, torch.zeros(5, dtype=torch.long))
+    ours, obs, first = ActorCritic(3, 2, 4, hidden=(8,)), torch.randn(5, 3), torch.eye(4)[0]
+    ours.mean[3:], ours.std[3:] = 0.25, 0.4
+    before = ours.act(obs, ours.untold), ours.value(obs, ours.untold)
+    told = ours.act(obs, first)
     with torch.no_grad():
         ours.actor_features.of_obs.weight.zero_()
         ours.critic_features.of_obs.weight.zero_()
-    for mine, theirs in zip(before, (ours.act(obs, untold), ours.value(obs, untold)), strict=True):
+    for mine, theirs in zip(before, (ours.act(obs, ours.untold), ours.value(obs, ours.untold)), strict=True):
         torch.testing.assert_close(mine, theirs)
-    assert (ours.act(obs, torch.zeros(5, dtype=torch.long)) != told).any()
+    assert (ours.act(obs, first) != told).any()

@@ -64,10 +64,10 @@ def test_same_seed_gives_the_same_and_leaves_the_random_numbers_of_others() -> N
 def test_policy_knows_what_to_do_in_each_situation() -> None:
     made = search(PolicySearch(steps=3000, updates_per_step=0.5, batch_size=64, hidden=(32, 32), random_steps=100))
     actor_critic = made.actor_critic()
-    right, left = (actor_critic.act(torch.tensor([[-1.0], [1.0]]), torch.tensor([i, i]))[:, 0] for i in (0, 1))
+    right, left = (actor_critic.act(torch.tensor([[-1.0], [1.0]]), told)[:, 0] for told in torch.eye(2))
     assert right[0] > 0.3 > -0.3 > right[1]
     assert left[0] < -0.3 < 0.3 < left[1]
-    near, far = actor_critic.value(torch.tensor([[0.0], [1.8]]), torch.tensor([0, 0]))
+    near, far = actor_critic.value(torch.tensor([[0.0], [1.8]]), torch.eye(2)[0])
     assert near > far
 
 
@@ -77,7 +77,7 @@ def test_actor_is_that_of_stable_baselines() -> None:
     actor_critic, sac = made.actor_critic(), made.sac
     obs = np.array([[0.3, 1.0, 0.0], [-0.4, 0.0, 1.0]], np.float32)
     expected, _ = sac.predict(sac.get_vec_normalize_env().normalize_obs(obs), deterministic=True)
-    found = actor_critic.act(torch.as_tensor(obs[:, :1]), torch.tensor([0, 1]))
+    found = actor_critic.act(torch.as_tensor(obs[:, :1]), torch.eye(2))
     np.testing.assert_allclose(2.0 * found.numpy(), expected, rtol=1e-4, atol=1e-5)
 
 
