@@ -117,7 +117,7 @@ class EmbeddingAdapter:
         """Sums the posterior over what each training situation is a part of, (B, N)."""
         return self.candidates.marginal(belief.posterior)
 
-    def likeliest(self, belief: Belief) -> Tensor:
+    def shares(self, belief: Belief) -> Tensor:
         """Says how much of each training situation the most likely candidate is, (B, N)."""
         return self.candidates.shares[belief.log_posterior.argmax(dim=1)]
 
@@ -234,7 +234,7 @@ class GradientAdapter:
         """Returns ones, (B, 1): there is nothing to tell apart."""
         return torch.ones_like(belief.log_posterior)
 
-    def likeliest(self, belief: Belief) -> Tensor:
+    def shares(self, belief: Belief) -> Tensor:
         """Returns ones, (B, 1), as :meth:`likely`."""
         return self.likely(belief)
 

@@ -53,7 +53,7 @@ class Adapter(Protocol):
     def likely(self, belief: Belief) -> Tensor:
         """Returns how likely each training situation is, alone or as a part, (B, N)."""
 
-    def likeliest(self, belief: Belief) -> Tensor:
+    def shares(self, belief: Belief) -> Tensor:
         """Returns how much of each training situation the most likely candidate is, (B, N)."""
 
     def posterior(self, belief: Belief, situations: Sequence[str]) -> dict[str, float]:
@@ -139,7 +139,7 @@ class Controller:
         if self.guide is not None:
             likely = self.adapter.likely(state.belief)
             proposals = self.guide.proposals(model, obs, likely, self.planner.horizon, generator)
-            objective = self.guide.looking_beyond(self.objective, self.adapter.likeliest(state.belief), model)
+            objective = self.guide.looking_beyond(self.objective, self.adapter.shares(state.belief), model)
             judge = self.guide.judge(objective, model, obs, proposals[:, :1])
         action, plan = self.planner.plan(judge, state.plan, generator, proposals, deadline)
         return action, replace(state, plan=shift(plan), last=(obs, action))

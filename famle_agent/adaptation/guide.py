@@ -46,7 +46,7 @@ class Guide:
     ) -> Tensor:
         """Rolls the actor through the adapted model, (B, 2 M + 1, H, action_dim) for M situations.
 
-        The last plan does nothing, so that a robot is not moved to its harm.
+        The last plan is to do nothing: a policy that has learnt little can be worse than that.
 
         Args:
             model: The adapted dynamics of B robots.
@@ -73,15 +73,15 @@ class Guide:
         idle = self.idle.expand(B, 1, horizon, -1)
         return torch.cat([torch.stack(actions, dim=2), idle], dim=1)
 
-    def looking_beyond(self, objective: Objective, likeliest: Tensor, model: Simulator) -> Objective:
+    def looking_beyond(self, objective: Objective, shares: Tensor, model: Simulator) -> Objective:
         """Adds the critics' value of where a plan ends.
 
         Args:
             objective: What counts until then.
-            likeliest: What is most likely the case, as shares of the training situations, (B, N).
+            shares: How much of each training situation the most likely candidate is, (B, N).
             model: The adapted dynamics of B robots.
         """
-        told = model.rows(likeliest[:, None, None])  # (B * P, 1, N)
+        told = model.rows(shares[:, None, None])  # (B * P, 1, N)
         value = partial(self.actor_critic.value, told=told)
         return replace(objective, value_fn=value, discount=float(self.actor_critic.discount))
 

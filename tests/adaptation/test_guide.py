@@ -41,12 +41,12 @@ def test_proposals_are_what_the_actor_would_do_in_the_likely_situations() -> Non
 def test_value_of_what_is_most_likely_lies_beyond_a_plan() -> None:
     guide, model, obs = made()
     guide.actor_critic.discount.fill_(0.5)
-    likeliest = torch.tensor([[-1.0, 1.0, 1.0], [0.0, 0.0, 1.0]])  # a sum of two, and one alone
-    objective = guide.looking_beyond(Objective(lambda s, a, s_next: s_next[..., 0]), likeliest, model)
+    shares = torch.tensor([[-1.0, 1.0, 1.0], [0.0, 0.0, 1.0]])  # a sum of two, and one alone
+    objective = guide.looking_beyond(Objective(lambda s, a, s_next: s_next[..., 0]), shares, model)
     actions = torch.randn(2, 3, 1, 1).clamp(-1.0, 1.0)
     found = model.returns(objective, obs, actions)
     after = model(obs[:, None].expand(-1, 3, -1), actions[:, :, 0])  # (2, P, 3, obs_dim)
-    values = torch.stack([guide.actor_critic.value(after[i], told) for i, told in enumerate(likeliest)])
+    values = torch.stack([guide.actor_critic.value(after[i], told) for i, told in enumerate(shares)])
     torch.testing.assert_close(found, (after[..., 0] + 0.5 * values).mean(dim=1), rtol=1e-4, atol=1e-5)
 
 

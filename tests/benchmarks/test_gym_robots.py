@@ -126,3 +126,18 @@ def test_pendulum_hangs_at_first() -> None:
     np.testing.assert_allclose(obs, [-1.0, 0.0, 0.0], atol=1e-6)
     after, *_ = env.step(np.zeros(1, np.float32))
     np.testing.assert_allclose(after, obs, atol=1e-3)  # it stays there
+
+
+def test_rivals_get_as_many_steps_as_a_changed_agent(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    taken: list[int] = []
+
+    class Counting:
+        def learn(self, train: Any, settings: PolicySearch, seed: int) -> Any:
+            taken.append(settings.steps)
+            return lambda obs: obs
+
+    monkeypatch.setattr(gym_robots, "BEDS", {"small": small_bed})
+    monkeypatch.setattr(gym_robots, "MODEL_FREE", {"sac": Counting()})
+    gym_robots.actor_of("sac", "small", 0, tmp_path, ("policy_steps=700",))
+    gym_robots.actor_of("sac", "small", 0, tmp_path, ())
+    assert taken == [700, 500_000]  # what it says, and the default of all robots
