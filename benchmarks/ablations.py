@@ -33,14 +33,13 @@ PIECES: Mapping[str, Mapping[str, Any]] = {
     "all": {},
     "no sums": {"compose": False},
     "whole evidence": {"likelihood_power": 1.0},
-    "members alike": {"posterior_sampling": False},
     "steps anew": {"warm_start": False},
     "no steps": {"adapt_steps": 0},
-    "nearest embedding": {"adapt_steps": 0, "compose": False, "posterior_sampling": False},
+    "nearest embedding": {"adapt_steps": 0, "compose": False},
     "frozen": {"adapt_every": 0},
 }
-"""What is taken away: nothing; sums of embeddings; evidence that is tempered; members that start from different
-situations; gradient steps that go on; all gradient steps; these, sums and different starts; all adaptation."""
+"""What is taken away: nothing; sums of embeddings; evidence that is tempered; gradient steps that go on;
+all gradient steps; these and sums; all adaptation."""
 
 
 @dataclass(frozen=True)

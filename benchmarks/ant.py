@@ -43,7 +43,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "famle-48": {"candidates": 48},
     "famle-frozen": {"adapt_every": 0},
     "famle-select": {"adapt_steps": 0},
-    "famle-nearest": {"adapt_steps": 0, "compose": False, "posterior_sampling": False},
+    "famle-nearest": {"adapt_steps": 0, "compose": False},
     "famle-window": {"hazard": 0.0, "likelihood_power": 1.0, "selection_size": 100},
     "famle-h": {"adapt_lr": 0.0},
     "famle-validated": {"validation_size": 10},

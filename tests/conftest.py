@@ -37,7 +37,6 @@ SMALL: dict[str, Any] = {
     "hazard": 0.0,
     "likelihood_power": 1.0,
     "compose": False,
-    "posterior_sampling": False,
     "adapt_steps": 20,
     "adapt_batch_size": 64,
     "adapt_embedding_lr": 0.05,

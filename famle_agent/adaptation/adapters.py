@@ -190,7 +190,7 @@ class EmbeddingAdapter:
         return (gain[:, 0] > 0.0) | (gain.amax(dim=1) > self._surprise)
 
     def _selected(self, belief: Belief) -> Belief:
-        return select(self.model, self.candidates, belief, self.settings.posterior_sampling)
+        return select(self.model, self.candidates, belief)
 
 
 @dataclass(frozen=True)

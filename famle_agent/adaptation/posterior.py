@@ -43,7 +43,6 @@ from famle_agent.models.likelihood import trust
 __all__ = [
     "expected_square",
     "filtered_posterior",
-    "systematic_sample",
     "updated_bias",
     "updated_excess",
     "window_posterior",
@@ -116,19 +115,3 @@ def updated_excess(excess: Tensor, squared: Tensor, seen: Tensor) -> Tensor:
         seen: n, how many transitions the memory holds, the newest among them, (B,).
     """
     return torch.lerp(excess, squared, (1.0 / (_BELIEVED + seen.clamp(max=_REMEMBERED)))[:, None])
-
-
-def systematic_sample(posterior: Tensor, n: int, offset: float) -> Tensor:
-    """Draws n candidates for each robot, (B, n), each about n times its probability often.
-
-    Systematic resampling, as in a particle filter: the candidates at the quantiles (i + offset) / n.
-
-    Args:
-        posterior: (B, C).
-        n: Size of the sample.
-        offset: In [0, 1).
-    """
-    descending, order = posterior.sort(dim=1, descending=True, stable=True)
-    at = (torch.arange(n, device=posterior.device, dtype=posterior.dtype) + offset) / n
-    index = torch.searchsorted(descending.cumsum(dim=1), at.expand(len(posterior), n).contiguous(), right=True)
-    return order.gather(1, index.clamp(max=posterior.shape[1] - 1))

@@ -126,8 +126,6 @@ class Adaptation:
             stand for both faults at once; the paper has none.
         likelihood_power: Exponent of the likelihood of a transition; below 1 where errors are not independent of each
             other, so that one strange moment does not overturn what many have shown. The paper's is 1.
-        posterior_sampling: Whether the members of the ensemble start from situations that are sampled from the
-            posterior, instead of all from the most likely one (the paper's).
         gradient: The gradient steps on theta and h; None only selects an embedding.
         clamp_predictions: Whether a plan may imagine no observation beyond the range of those in the memory, as soon as
             a robot has adapted.
@@ -140,7 +138,6 @@ class Adaptation:
     evidence: Window | Filter = Window()
     compose: bool = False
     likelihood_power: float = 1.0
-    posterior_sampling: bool = False
     gradient: GradientSteps | None = GradientSteps()
     clamp_predictions: bool = False
 

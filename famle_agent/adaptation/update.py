@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import torch
@@ -10,7 +9,6 @@ import torch
 from famle_agent.adaptation.belief import Belief, choose
 from famle_agent.adaptation.candidates import Candidates
 from famle_agent.adaptation.memory import Memory, Sample, minibatches, whole_memory
-from famle_agent.adaptation.posterior import systematic_sample
 from famle_agent.adaptation.settings import Adaptation
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
@@ -18,26 +16,17 @@ from famle_agent.utils.deadline import Deadline
 
 __all__ = ["descend", "gradient_steps", "select"]
 
-_GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)  # multiples of it, less their whole part, fill [0, 1) evenly
 
-
-def select(model: Dynamics, candidates: Candidates, belief: Belief, spread: bool = False) -> Belief:
+def select(model: Dynamics, candidates: Candidates, belief: Belief) -> Belief:
     """Line 2: theta_meta with the most likely embedding, h_likely = argmax log p(D_M | theta_meta, h) (eq. 12).
 
     Args:
         model: Holds theta_meta.
         candidates: The embeddings to select from.
         belief: Its posterior counts.
-        spread: Whether the members of the ensemble begin with candidates that are sampled from the posterior, others
-            each time, instead of all with the most likely one. A plan has to be good then in several situations that
-            may be the case, and a robot that is stuck tries what it would do in another one.
     """
     likeliest = belief.log_posterior.argmax(dim=1)  # (B,)
-    likely = likeliest[:, None]
-    if spread:
-        offset = belief.adaptations * _GOLDEN_RATIO % 1.0
-        likely = systematic_sample(belief.posterior, model.members, offset)  # (B, P)
-    theta_meta, h_likely = model.theta_of(len(likely)), candidates.chosen(likely)
+    theta_meta, h_likely = model.theta_of(len(likeliest)), candidates.chosen(likeliest[:, None])
     new = replace(belief, theta=theta_meta, h=h_likely, candidate=likeliest)
     return replace(new, recognised=torch.zeros_like(belief.recognised), adaptations=belief.adaptations + 1)
 

@@ -20,7 +20,6 @@ _WITHOUT_EMBEDDINGS: Mapping[str, Any] = {
     "interaction_rank": 0,
     "compose": False,
     "hazard": 0.0,
-    "posterior_sampling": False,
 }
 
 

@@ -47,7 +47,8 @@ def parts_of(values: Mapping[str, Any], chosen: Set[str]) -> dict[str, Any]:
     """Builds the parts of a :class:`~famle_agent.agents.config.Config`; arguments and errors as of its ``of``."""
     for old in chosen & _RENAMED.keys():
         warnings.warn(f"The setting {old} is called {_RENAMED[old]}.", DeprecationWarning, stacklevel=3)
-    values = {_RENAMED.get(name, name): value for name, value in values.items() if name != _UNUSED or value}
+    gone = _GONE - chosen
+    values = {_RENAMED.get(name, name): value for name, value in values.items() if name not in gone}
     chosen = {_RENAMED.get(name, name) for name in chosen}
     for name, value in values.items():
         if name not in HINTS:
@@ -224,9 +225,7 @@ _NAMES: dict[type, dict[str, str]] = {
     Adaptation: {
         "every": "adapt_every",
         "at_reset": "adapt_at_reset",
-        **_same(
-            "memory_size", "forget_at_reset", "compose", "likelihood_power", "posterior_sampling", "clamp_predictions"
-        ),
+        **_same("memory_size", "forget_at_reset", "compose", "likelihood_power", "clamp_predictions"),
     },
     Window: {"size": "selection_size"},
     Filter: _same("hazard"),
@@ -281,11 +280,11 @@ SAFETY = frozenset(_NAMES[Safety].values())
 SEEN_IN_DIMS = {"egocentric", "raw_angles"}
 """Settings by which models differ where their dimensions do, which are compared by themselves."""
 
-_RENAMED = {"keep_adapting": "warm_start", "spread_members": "posterior_sampling"}
+_RENAMED = {"keep_adapting": "warm_start"}
 """Settings by the names of version 0.1, which its files have."""
 
-_UNUSED = "adapt_decay"
-"""A setting of version 0.1 that is 0 in its files."""
+_GONE = {"adapt_decay", "spread_members", "posterior_sampling"}
+"""Settings of former versions, which their files have; their first was always 0, and the others changed no return."""
 
 AT_LEAST_ONE = {
     *("policy_batch_size", "transitions_per_situation", "action_hold", "round_transitions"),

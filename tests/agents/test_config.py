@@ -297,7 +297,9 @@ def test_nested_settings_are_taken_as_they_are() -> None:
 def test_old_names_go_on_working() -> None:
     with pytest.warns(DeprecationWarning, match="keep_adapting is called warm_start"):
         assert settings(keep_adapting=True) == settings(warm_start=True)
-    assert Config.of({"spread_members": True}) == settings(posterior_sampling=True)  # as in a file
+    assert Config.of({"spread_members": True, "posterior_sampling": True}) == Config()  # as in files
+    with pytest.raises(TypeError, match="no setting 'posterior_sampling'"):
+        settings(posterior_sampling=True)
     with pytest.warns(DeprecationWarning, match="Config"):
         assert famle_agent.Hyperparameters(horizon=3) == Config.of({"horizon": 3})
     agent = FAMLE("Pendulum-v1", device="cpu", horizon=3)

@@ -32,7 +32,7 @@ def test_rivals_have_no_embeddings_in_any_mode(make_env: Callable[..., Any], riv
     config = config_of(rival, make_env(), mode)
     model, adaptation, training = config.model, config.adaptation, config.training
     assert (model.embedding_dim, model.interaction_rank, model.gate_actions) == (1, 0, False)
-    assert (adaptation.compose, adaptation.posterior_sampling, type(adaptation.evidence)) == (False, False, Window)
+    assert (adaptation.compose, type(adaptation.evidence)) == (False, Window)
     assert adaptation.gradient is not None
     assert adaptation.gradient.embedding_lr == 0
     assert training.joint is None or training.joint.embedding_lr == 0

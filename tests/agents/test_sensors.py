@@ -69,9 +69,9 @@ SETTINGS: dict[str, Any] = {
     "joint_iterations": 60,
     "meta_iterations": 0,
 }
-FILTER = {"hazard": 0.01, "likelihood_power": 0.5, "compose": True, "posterior_sampling": True, "members": 2}
+FILTER = {"hazard": 0.01, "likelihood_power": 0.5, "compose": True, "members": 2}
 KINDS: dict[str, tuple[type[ModelBasedAgent], dict[str, Any]]] = {
-    "window": (FAMLE, {"warm_start": False, "hazard": 0.0, "compose": False, "posterior_sampling": False}),
+    "window": (FAMLE, {"warm_start": False, "hazard": 0.0, "compose": False}),
     "filter": (FAMLE, {"degrees_of_freedom": 3.0, "adapt_batch_size": 8, **FILTER}),
     "sgd": (AMPC, {"joint_iterations": 0, "adapt_optimizer": "sgd", "adapt_lr": 0.3}),
 }
