@@ -4,7 +4,8 @@ python -m benchmarks.sim_to_sim                                      # the shipp
 python -m benchmarks.sim_to_sim --simulator mujoco --robots reacher  # the other way: meta-learns in MuJoCo first
 
 The other engine and the damage are all that is strange to the agent: no profile makes the robot differ further. The
-oracle is FAMLE in the engine that it has learnt in, on the same robot with the same damage.
+oracle is FAMLE that has learnt in the engine that the robot runs in. "home" is the agent itself in the engine that it
+has learnt in, with the same damage, which says whether the robot is as good there.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ from famle_envs import Situation
 
 OTHER: Mapping[Engine, Engine] = {"pybullet": "mujoco", "mujoco": "pybullet"}
 NAMES: Mapping[Engine, str] = {"pybullet": "PyBullet", "mujoco": "MuJoCo"}
-FROZEN, ORACLE = "famle-frozen", "oracle"
-KNOWN = {**METHODS, ORACLE: METHODS["famle"]}
+FROZEN, ORACLE, HOME = "famle-frozen", "oracle", "home"
+KNOWN = {**METHODS, ORACLE: METHODS["famle"], HOME: METHODS["famle"]}
 
 _ARM_EPISODE = 50  # steps
 _SOLVED = {name: experiment_named(name).threshold for name in ("reacher-random", "ant-unseen")}
@@ -102,8 +103,8 @@ BEDS: Mapping[str, Bed] = {
 class Args(Options):
     """Agents that are meta-learned in one engine and run in the other."""
 
-    methods: tuple[str, ...] = ("famle", FROZEN, "famle-nearest", "ampc-reptile", "ampc", ORACLE)
-    """Entries of benchmarks.methods.METHODS; the oracle is FAMLE in the simulator."""
+    methods: tuple[str, ...] = ("famle", FROZEN, "famle-nearest", "ampc-reptile", "ampc", ORACLE, HOME)
+    """Entries of benchmarks.methods.METHODS; oracle and home are FAMLE that knows the robot's engine."""
     robots: tuple[str, ...] = tuple(BEDS)
     """What is broken."""
     simulator: Engine = "pybullet"
@@ -124,8 +125,7 @@ def task_of(robot: str, seed: int, args: Args) -> Task:
         robot,
         seed,
         BEDS[robot].situation(seed),
-        # Files of models are named after robots and methods, and not after engines.
-        args.cache if args.simulator == "pybullet" else args.cache / args.simulator,
+        cache_of(args.simulator, args.cache),
         device=args.device,
         engine=OTHER[args.simulator],
         simulator=args.simulator,
@@ -133,11 +133,19 @@ def task_of(robot: str, seed: int, args: Args) -> Task:
     )
 
 
-def run(method: str, tasks: Sequence[Task]) -> list[Result]:
+def cache_of(simulator: Engine, cache: Path) -> Path:
+    """Names the folder of what is learnt in an engine: files are named after robots and methods, and not after that."""
+    return cache if simulator == "pybullet" else cache / simulator
+
+
+def run(method: str, tasks: Sequence[Task], cache: Path) -> list[Result]:
     """Runs one replicate."""
     if method == ORACLE:
-        method, tasks = "famle", [replace(task, engine=task.simulator) for task in tasks]
-    return BEDS[tasks[0].robot].run(method, tasks)
+        home = tasks[0].engine
+        tasks = [replace(task, simulator=home, cache=cache_of(home, cache)) for task in tasks]
+    if method == HOME:
+        tasks = [replace(task, engine=task.simulator) for task in tasks]
+    return BEDS[tasks[0].robot].run("famle" if method in (ORACLE, HOME) else method, tasks)
 
 
 def path_of(robot: str, simulator: Engine, out: Path) -> Path:
@@ -186,7 +194,7 @@ def main(args: Args) -> None:
     for robot in args.robots:
         tasks = [task_of(robot, seed, args) for seed in range(args.replicates)]
         table = path_of(robot, args.simulator, args.out)
-        compare(args.methods, tasks, run, table, args, KNOWN)
+        compare(args.methods, tasks, partial(run, cache=args.cache), table, args, KNOWN)
         found = summary(robot, load(table)).rename(index=lambda method: style_of(method).label)
         bed, where = BEDS[robot], NAMES[OTHER[args.simulator]]
         print(f"\n{robot} in {where}, learnt in {NAMES[args.simulator]}: {bed.label}; recovered: {bed.recovery}")

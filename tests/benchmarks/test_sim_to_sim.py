@@ -12,7 +12,7 @@ import pytest
 from benchmarks import sim_to_sim
 from benchmarks.methods import METHODS, famle
 from benchmarks.results import Result, load
-from benchmarks.sim_to_sim import BEDS, ORACLE, OTHER, Args, main, path_of, run, summary, task_of
+from benchmarks.sim_to_sim import BEDS, HOME, ORACLE, OTHER, Args, cache_of, main, path_of, run, summary, task_of
 from benchmarks.task import Engine, Task
 from famle_envs.robot_env import RobotEnv
 from tests.small_reacher import task_of as arm
@@ -28,18 +28,22 @@ def robot_of(task: Task) -> RobotEnv:
 
 @pytest.mark.parametrize("simulator", SIMULATORS)
 @pytest.mark.parametrize("robot", BEDS)
-def test_robot_is_broken_as_the_oracles_and_runs_in_the_other_engine(
-    robot: str, simulator: Engine, monkeypatch: pytest.MonkeyPatch
+def test_all_have_the_same_damage_and_differ_by_engines(
+    robot: str, simulator: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def watch(method: str, tasks: Sequence[Task]) -> list[Result]:
-        made = robot_of(tasks[0])
-        return [{"method": method, "engine": made.engine, "situation": made.situation}]
+        made, simulated, task = robot_of(tasks[0]), tasks[0].simulated(), tasks[0]
+        simulated.close()
+        learnt_in: Any = simulated.unwrapped
+        engines = learnt_in.engine, made.engine
+        return [{"method": method, "engines": engines, "cache": task.cache, "situation": made.situation}]
 
     monkeypatch.setattr(sim_to_sim, "BEDS", {**BEDS, robot: replace(BEDS[robot], run=watch)})
-    task = task_of(robot, 1, Args(simulator=simulator))
-    (there,), (at_home,) = run("famle", [task]), run(ORACLE, [task])
-    assert there == {"method": "famle", "engine": OTHER[simulator], "situation": task.situation}
-    assert at_home == {"method": "famle", "engine": simulator, "situation": task.situation}
+    task, other = task_of(robot, 1, Args(simulator=simulator, cache=tmp_path)), OTHER[simulator]
+    for method, engines in (("famle", (simulator, other)), (ORACLE, (other, other)), (HOME, (simulator, simulator))):
+        (found,) = run(method, [task], tmp_path)
+        learnt = {"engines": engines, "cache": cache_of(engines[0], tmp_path)}
+        assert found == {"method": "famle", "situation": task.situation, **learnt}
 
 
 def test_models_of_one_engine_are_not_taken_for_those_of_the_other() -> None:
@@ -79,7 +83,7 @@ def test_benchmarks_have_the_engine_that_they_ask_for_whatever_the_default_is(
 def test_replicates_take_turns_with_models_and_are_stored_summed_up_and_drawn(
     simulator: Engine, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    methods = ("famle", "famle-frozen", ORACLE)
+    methods = ("famle", "famle-frozen", ORACLE, HOME)
     args = Args(
         methods=methods,
         replicates=3,
@@ -91,9 +95,11 @@ def test_replicates_take_turns_with_models_and_are_stored_summed_up_and_drawn(
     )
     args = replace(args, meta_trainings=2)
     main(args)
-    shown, cache = capsys.readouterr().out, task_of("reacher", 0, args).cache
+    shown = capsys.readouterr().out
     assert all(label in shown for label in ("learnt in", "FAMLE, no adaptation", "oracle", "gap_closed"))
-    assert {path.name for path in cache.glob("*.zip")} == {"reacher-ours-0.zip", "reacher-ours-1.zip"}
+    for engine in SIMULATORS:  # the oracle learns in the other one
+        learnt = {path.name for path in cache_of(engine, args.cache).glob("*.zip")}
+        assert learnt == {"reacher-ours-0.zip", "reacher-ours-1.zip"}
     results = load(path_of("reacher", simulator, tmp_path))
     assert results.groupby("method").size().to_dict() == dict.fromkeys(methods, 3)
     assert results.groupby("method")["situation"].agg(list).map(tuple).nunique() == 1
