@@ -80,7 +80,7 @@ BEDS: Mapping[str, Bed] = {
         lambda result: bool(result["return"] > _SOLVED["ant-unseen"]),
     ),
     "quadruped": Bed(
-        f"gaits to the goal, {_GAITS + 1} where it is not reached",
+        f"gaits to the goal, else {_GAITS + 1}",
         "at the goal",
         lambda seed: quadruped.task_of("both", seed, quadruped.Args()).situation,
         quadruped.run,
@@ -184,7 +184,7 @@ def picture(out: Path) -> Figure:
     for simulator in OTHER:
         for robot, bed in BEDS.items():
             if (path := path_of(robot, simulator, out)).exists():
-                where = f"{robot}, from {NAMES[simulator]} to {NAMES[OTHER[simulator]]}"
+                where = f"{robot}, {NAMES[simulator]} to {NAMES[OTHER[simulator]]}"
                 panels[where] = (scores(robot, load(path)), bed.label)
     return draw_scores(panels)
 
