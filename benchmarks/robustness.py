@@ -248,6 +248,7 @@ def repeated(tried: str, times: int, once: Callable[[int], object]) -> Row:
     What is left counts where it grows in the first half of what follows and in the second one: a leak does so, and a
     cache that fills late does not.
     """
+    gc.collect()  # or what others have left would go meanwhile, and hide what is left of this
     memory, held, looks = np.zeros(times), list[dict[str, int]](), (times // 5, 3 * times // 5, times - 1)
     for i in range(times):
         once(i)
