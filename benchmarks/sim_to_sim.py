@@ -141,8 +141,7 @@ def cache_of(simulator: Engine, cache: Path) -> Path:
 def run(method: str, tasks: Sequence[Task], cache: Path) -> list[Result]:
     """Runs one replicate."""
     if method == ORACLE:
-        home = tasks[0].engine
-        tasks = [replace(task, simulator=home, cache=cache_of(home, cache)) for task in tasks]
+        tasks = [replace(task, simulator=task.engine, cache=cache_of(task.engine, cache)) for task in tasks]
     if method == HOME:
         tasks = [replace(task, engine=task.simulator) for task in tasks]
     return BEDS[tasks[0].robot].run("famle" if method in (ORACLE, HOME) else method, tasks)

@@ -47,13 +47,14 @@ def parts_of(values: Mapping[str, Any], chosen: Set[str]) -> dict[str, Any]:
     """Builds the parts of a :class:`~famle_agent.agents.config.Config`; arguments and errors as of its ``of``."""
     for old in chosen & _RENAMED.keys():
         warnings.warn(f"The setting {old} is called {_RENAMED[old]}.", DeprecationWarning, stacklevel=3)
-    gone = _GONE - chosen
+    gone = {name for name, value in values.items() if name in _GONE - chosen or (name == _UNUSED and not value)}
     values = {_RENAMED.get(name, name): value for name, value in values.items() if name not in gone}
     chosen = {_RENAMED.get(name, name) for name in chosen}
     for name, value in values.items():
         if name not in HINTS:
             close = difflib.get_close_matches(name, HINTS, n=1)
             hint = f" Did you mean {close[0]!r}?" if close else ""
+            hint = " It is gone; leave it out." if name in _GONE else hint
             raise TypeError(f"There is no setting {name!r}.{hint} Settings: {', '.join(HINTS)}.")
         _check_type(name, value)
     read = _Reader(values)
@@ -283,8 +284,11 @@ SEEN_IN_DIMS = {"egocentric", "raw_angles"}
 _RENAMED = {"keep_adapting": "warm_start"}
 """Settings by the names of version 0.1, which its files have."""
 
-_GONE = {"adapt_decay", "spread_members", "posterior_sampling"}
-"""Settings of former versions, which their files have; their first was always 0, and the others changed no return."""
+_UNUSED = "adapt_decay"
+"""A setting of version 0.1 that is 0 in its files."""
+
+_GONE = {"spread_members", "posterior_sampling"}
+"""Names of a setting of former versions that files may have; it changed no return beyond the noise."""
 
 AT_LEAST_ONE = {
     *("policy_batch_size", "transitions_per_situation", "action_hold", "round_transitions"),

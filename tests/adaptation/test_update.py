@@ -18,7 +18,7 @@ from famle_agent.adaptation.posterior import window_posterior
 from famle_agent.adaptation.update import descend, select
 from famle_agent.models.dynamics import Dynamics
 from famle_agent.models.gradient_steps import InnerLoop
-from tests.helpers import adapted, memory_of
+from tests.helpers import adapted, memory_of, simple_model
 
 INNER_LOOP = InnerLoop(steps=10, lr=1e-3, embedding_lr=0.05, optimizer="adam")
 CPU = torch.device("cpu")
@@ -106,6 +106,16 @@ def test_selection_takes_an_embedding_and_what_was_meta_learned(
     likely = model.embeddings[0, belief.posterior.argmax(dim=1)].detach()
     torch.testing.assert_close(selected.h[:, 0], likely, rtol=0, atol=1e-5)
     assert all(torch.equal(value, start.theta[name]) for name, value in selected.theta.items())
+
+
+def test_each_member_begins_with_its_own_embedding_of_the_likeliest_situation() -> None:
+    several = simple_model(n_situations=4, members=4)
+    candidates = Candidates.of(several, compose=False)
+    log_posterior = torch.tensor([[0.4, 0.3, 0.2, 0.1], [0.1, 0.1, 0.7, 0.1]]).log()
+    selected = select(several, candidates, replace(prior(several, candidates, 2), log_posterior=log_posterior))
+    assert selected.candidate.tolist() == [0, 2]
+    torch.testing.assert_close(selected.h[0], several.embeddings[:, 0])
+    torch.testing.assert_close(selected.h[1], several.embeddings[:, 2])
 
 
 def test_descent_goes_on_from_where_a_belief_is(model: Dynamics, candidates: Candidates, held_out: Transitions) -> None:

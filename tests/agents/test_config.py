@@ -298,8 +298,12 @@ def test_old_names_go_on_working() -> None:
     with pytest.warns(DeprecationWarning, match="keep_adapting is called warm_start"):
         assert settings(keep_adapting=True) == settings(warm_start=True)
     assert Config.of({"spread_members": True, "posterior_sampling": True}) == Config()  # as in files
-    with pytest.raises(TypeError, match="no setting 'posterior_sampling'"):
-        settings(posterior_sampling=True)
+    assert Config.of({"adapt_decay": 0.0}) == Config()
+    with pytest.raises(TypeError, match="no setting 'adapt_decay'"):
+        Config.of({"adapt_decay": 0.5})  # which nothing does any more
+    for gone in ("posterior_sampling", "spread_members"):
+        with pytest.raises(TypeError, match=f"no setting '{gone}'. It is gone; leave it out"):
+            settings(**{gone: True})
     with pytest.warns(DeprecationWarning, match="Config"):
         assert famle_agent.Hyperparameters(horizon=3) == Config.of({"horizon": 3})
     agent = FAMLE("Pendulum-v1", device="cpu", horizon=3)
